@@ -1,28 +1,12 @@
 #!/usr/bin/env bash
 # Flies a snapshot through courses without exploration, and prints how far it got.
 set -euo pipefail
-source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
+# shellcheck source=common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
-help_if_asked "$@" <<END
-Usage: launch/evaluate.sh --run DIR | --snapshot FILE [--course FILE ... | --suite FILE] [--flights N] [--json FILE] [--record FILE] [--threads N]
-
-Flies a trained snapshot from the start of level 1, without exploration noise, and prints per course how many flights passed
-each wall, the share R of walls passed, how many courses were completed, and what the other flights failed by.
-
-Options:
-  --run DIR        evaluate the best snapshot of this run (the latest, if none was confirmed as best)
-  --snapshot FILE  evaluate this snapshot
-  --course FILE    fly this course; may be repeated [default: the evaluation courses of the snapshot's run]
-  --suite FILE     fly this suite of courses and disturbances, as configs/evaluations/generalist.toml
-  --flights N      flights per course or entry [default: evaluation.flights of that run, 100 as shipped, or what the suite says]
-  --json FILE      write the table as JSON as well
-  --record FILE    write every step (pose, velocity, depth image, latent, action, reward terms) as .npz, for numpy; held in memory until then,
-                   some megabyte a flight
-  --threads N      threads to fly on; the result does not depend on it [default: one a core]
-  -h, --help       this text
-
-Exit status: 0 evaluated, 1 failed, 2 wrong call.
+help_if_asked skein-evaluate -- "$@" <<END
+launch/evaluate.sh OPTIONS builds what flying needs and runs "skein-evaluate" with these options.
 END
 
-build
+build_evaluation
 run_built skein-evaluate "$@"

@@ -16,7 +16,9 @@ readonly NEEDED_MB=1700
 # For a download, one's own or somebody else's: enough at 0.3 MB/s.
 readonly LONGEST_WAIT_SECS=1800
 
-repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd -P)
+# With it, cd may go elsewhere and prints where it went.
+unset CDPATH
+repository=$(cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/.." && pwd -P)
 readonly repository
 readonly target="$repository/.libtorch"
 work=
@@ -39,8 +41,9 @@ fail() {
     exit 1
 }
 
+# A terminal or reader that is gone must not end the set-up.
 say() {
-    printf 'setup: %s\n' "$*" >&2
+    (trap '' PIPE && exec 3>&2 2>/dev/null && printf 'setup: %s\n' "$*" >&3) || true
 }
 
 remove_work() {

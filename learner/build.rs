@@ -1,4 +1,5 @@
-//! Tells the linker where libtorch lies at run time, so that binaries and tests start without `LD_LIBRARY_PATH`, and the learner of which sources it is made.
+//! Sets the run-time path of libtorch, so that binaries and tests start without `LD_LIBRARY_PATH`,
+//! and the commit that the learner reports as its version.
 
 use std::path::Path;
 use std::process::Command;
@@ -17,19 +18,21 @@ fn main() {
     }
 }
 
-/// What learning depends on: the packages that fly and learn, and what they are built with.
+/// Paths that learning depends on: the packages that fly and learn, and their build files.
 const SOURCES: [&str; 5] = ["Cargo.toml", "Cargo.lock", "learner", "protocol", "actor"];
 
-/// The last commit that changed one of the [`SOURCES`], with `-dirty` behind it where they are others now, new files among them; `None` outside a clone, and where
-/// none of them was ever committed.
+/// Returns the last commit that changed one of the [`SOURCES`], with `-dirty` appended if they
+/// differ from it or new files are among them. Returns `None` outside a clone, and if none of them
+/// was ever committed.
 fn commit() -> Option<String> {
     let package = std::env::var_os("CARGO_MANIFEST_DIR")?;
     let root = Path::new(&package).parent()?;
-    // Sources that were copied into another repository are not of its commits.
+    // Sources copied into another repository do not belong to its commits.
     if Path::new(&git(root, &["rev-parse", "--show-toplevel"])?) != root.canonicalize().ok()? {
         return None;
     }
-    // A change of commit shows in the last of them. A path that does not exist would make cargo ask at every build.
+    // The last path changes with every commit. A path that does not exist would make cargo run this
+    // script at every build.
     let moves = git(root, &["rev-parse", "--git-path", "logs/HEAD"])?;
     for path in SOURCES.into_iter().chain([moves.as_str()]) {
         let path = root.join(path);
@@ -38,13 +41,23 @@ fn commit() -> Option<String> {
         }
     }
     let of_sources = |command: &[&str]| git(root, &[command, &["--"], &SOURCES].concat());
-    let commit = of_sources(&["log", "-1", "--format=%h", "--abbrev=12"]).filter(|commit| !commit.is_empty())?;
+    let commit = of_sources(&["log", "-1", "--format=%h", "--abbrev=12"])
+        .filter(|commit| !commit.is_empty())?;
     let is_clean = of_sources(&["status", "--porcelain"])?.is_empty();
-    Some(if is_clean { commit } else { format!("{commit}-dirty") })
+    Some(if is_clean {
+        commit
+    } else {
+        format!("{commit}-dirty")
+    })
 }
 
 fn git(root: &Path, arguments: &[&str]) -> Option<String> {
-    let output = Command::new("git").arg("-C").arg(root).args(arguments).output().ok()?;
+    let output = Command::new("git")
+        .arg("-C")
+        .arg(root)
+        .args(arguments)
+        .output()
+        .ok()?;
     let text = String::from_utf8(output.stdout).ok()?;
     output.status.success().then(|| text.trim().to_owned())
 }

@@ -1,4 +1,5 @@
-//! Tells the linker where libtorch lies at run time, so that tests start without `LD_LIBRARY_PATH`; and the tests what they are built for.
+//! Tells the linker where libtorch lies at run time, so that tests start without `LD_LIBRARY_PATH`,
+//! and passes the target platform to the tests.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");
@@ -6,7 +7,7 @@ fn main() {
     if let Ok(target) = std::env::var("TARGET") {
         println!("cargo:rustc-env=SKEIN_TARGET={target}");
     }
-    // Set by torch-sys for the packages that depend on it directly.
+    // Set by torch-sys for packages that depend on it directly.
     if let Ok(libtorch) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
         println!("cargo:rustc-link-arg=-Wl,-rpath,{libtorch}");
     }

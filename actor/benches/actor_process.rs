@@ -1,6 +1,7 @@
-//! An actor as a process: how soon after its start the first record is there, and how much memory it takes.
+//! Benchmark of an actor process: time from its start to the first record, and its memory.
 //!
-//! The learner's ends are this program's, and answer at once: what is measured is the actor alone. Each figure is a line of JSON; `--quick` tries once.
+//! The benchmark is the learner and answers at once, so it measures only the actor. Each result is
+//! a line of JSON; `--quick` runs once.
 
 mod common;
 
@@ -10,17 +11,18 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::json;
-use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
+use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::ticket::{ControlRecord, Ticket};
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 
 use common::{Learner, ticket};
 
-/// Longer than any machine takes for a step.
+/// Longer than any machine needs for a step.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// Flights after which memory is looked at, each with a snapshot of its own: the actor then holds as many as it ever does, and has let go of others.
-const FLIGHTS: u64 = 12;
+/// Episodes before memory is measured, each with a new snapshot: then the actor's cache is full and
+/// has dropped snapshots.
+const EPISODES: u64 = 12;
 const ACTOR: ActorId = ActorId(0);
 
 fn main() {
@@ -40,9 +42,14 @@ fn main() {
         resident_bytes = resident_bytes.max(bytes);
     }
     start_secs.sort_by(f64::total_cmp);
-    let line = |name, figure, unit| println!("{}", json!({ "name": name, "figure": figure, "unit": unit }));
-    line("actor_process/start", start_secs[starts / 2] * 1e3, "ms");
-    line("actor_process/resident", resident_bytes as f64 / 1e6, "MB");
+    let print_result = |name, figure, unit| {
+        println!(
+            "{}",
+            json!({ "name": name, "figure": figure, "unit": unit })
+        )
+    };
+    print_result("actor_process/start", start_secs[starts / 2] * 1e3, "ms");
+    print_result("actor_process/resident", resident_bytes as f64 / 1e6, "MB");
 }
 
 impl Learner {
@@ -54,42 +61,50 @@ impl Learner {
         self.ports.publish(&snapshot).expect("there is memory");
     }
 
-    /// Starts an actor and lets it fly, first with the snapshot of this `version`, then with newer ones; seconds until its first record, and the most bytes that
-    /// were resident.
+    /// Starts an actor and lets it fly, first with the snapshot of this `version`, then with newer
+    /// ones. Returns the seconds until its first record, and its peak resident bytes.
     fn watch_an_actor(&self, version: &mut u64) -> (f64, u64) {
         let started = Instant::now();
         let actor = Actor::start(self.directory.path());
         let incarnation = self.until(|| {
-            let status = self.ports.receive_status().expect("its memory can be mapped")?;
-            // Late words of the actor before are none of this one's.
+            let status = self
+                .ports
+                .receive_status()
+                .expect("the actor's memory can be mapped")?;
+            // Skips late status records of the previous actor.
             let status = status.read(self.identity.run)?;
             (status.pid == actor.0.id()).then_some(status.incarnation)
         });
         self.fly(0, *version, incarnation);
         self.until(|| self.record(incarnation));
         let secs = started.elapsed().as_secs_f64();
-        for flight in 1..FLIGHTS {
-            self.until(|| Some(self.record(incarnation)?.kind == RecordKind::Closing.code()).filter(|closed| *closed));
+        for episode in 1..EPISODES {
+            self.until(|| {
+                Some(self.record(incarnation)?.kind == RecordKind::Closing.code())
+                    .filter(|closed| *closed)
+            });
             *version += 1;
             self.publish(*version);
-            self.fly(flight, *version, incarnation);
+            self.fly(episode, *version, incarnation);
         }
         (secs, actor.resident_bytes())
     }
 
-    fn fly(&self, flight: u64, version: u64, incarnation: Incarnation) {
+    fn fly(&self, episode: u64, version: u64, incarnation: ActorIncarnation) {
         let ticket = Ticket {
             policy_version: PolicyVersion(version),
-            ..ticket(self.identity.run, flight, 1)
+            ..ticket(self.identity.run, episode, 1)
         };
-        self.ports.maintain().expect("the actor's memory can be mapped");
+        self.ports
+            .maintain()
+            .expect("the actor's memory can be mapped");
         self.ports
             .send_control(ControlRecord::fly(&ticket, ACTOR, incarnation))
             .expect("there is memory");
         self.ports.wake_actors().expect("the event can be raised");
     }
 
-    fn record(&self, incarnation: Incarnation) -> Option<TransitionRecord> {
+    fn record(&self, incarnation: ActorIncarnation) -> Option<TransitionRecord> {
         let record = self
             .ports
             .receive_transition()
@@ -97,14 +112,14 @@ impl Learner {
         (record.incarnation == incarnation.0).then_some(*record)
     }
 
-    /// Looks for something until it is there.
+    /// Repeats `look` until it succeeds.
     fn until<T>(&self, mut look: impl FnMut() -> Option<T>) -> T {
         let start = Instant::now();
         loop {
             if let Some(found) = look() {
                 return found;
             }
-            assert!(start.elapsed() < PATIENCE, "the actor says nothing");
+            assert!(start.elapsed() < PATIENCE, "the actor does not answer");
             self.ports
                 .wait(Duration::from_micros(100))
                 .expect("events can be waited for");
@@ -112,7 +127,7 @@ impl Learner {
     }
 }
 
-/// A process that ends with this value.
+/// An actor process, killed when this value is dropped.
 struct Actor(Child);
 
 impl Actor {
@@ -125,18 +140,19 @@ impl Actor {
         Self(child.expect("the actor is built with its benchmarks"))
     }
 
-    /// The most memory that it had to itself or shared, as the kernel counts it.
+    /// Returns the peak resident memory, private and shared, as the kernel counts it.
     fn resident_bytes(&self) -> u64 {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id())).expect("it is there");
+        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id()))
+            .expect("the process exists");
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib: Option<u64> = line.and_then(|line| line.split_whitespace().next()?.parse().ok());
-        kib.expect("the kernel tells it in KiB") << 10
+        kib.expect("the kernel reports it in KiB") << 10
     }
 }
 
 impl Drop for Actor {
     fn drop(&mut self) {
-        // It may have ended by itself.
+        // The process may have ended already.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }

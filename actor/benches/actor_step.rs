@@ -1,9 +1,12 @@
-//! One actor's whole step, from the camera to the record sent, against the sum of its stages.
+//! Benchmark of an actor's whole step, from the camera to the sent record, against the sum of its
+//! stages.
 //!
-//! An iteration is a training flight through real shared memory, no longer than it must be: the shorter, the more of them nobody disturbs. Every stage is
-//! given exactly what it was made of, so that whatever the whole takes beyond the sum of the stages is the loop's own. The learner's end is emptied after
-//! each flight, outside the time taken. What an actor does for the learner's sake between two steps, to listen and to give signs of life (`control` in the table
-//! of a run), is in neither: it depends on what the learner says.
+//! An iteration is a training episode through real shared memory, as short as possible: shorter
+//! iterations are disturbed less often. Every stage gets the same inputs as in the whole, so the
+//! excess of the whole over the sum of the stages is the loop's own cost. The learner's buffer is
+//! emptied after each episode, outside the measured time. Neither side includes an actor's reading
+//! of messages and sending of heartbeats between two steps (`control` in the table of a run): it
+//! depends on the learner.
 
 mod common;
 
@@ -15,91 +18,114 @@ use criterion::measurement::WallTime;
 use criterion::{BenchmarkGroup, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_actor::agent::Agent;
-use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::View;
-use skein_protocol::ids::{ActorId, Incarnation};
+use skein_protocol::config::ObservationLayout;
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
-use skein_protocol::services::{ActorPorts, LoanedTransition, ServiceError};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+use skein_transport::{ActorPorts, LoanedTransition, ServiceError};
 
 use common::{Learner, ticket};
 
 const ACTOR: ActorId = ActorId(0);
-const INCARNATION: Incarnation = Incarnation(0);
+const INCARNATION: ActorIncarnation = ActorIncarnation(0);
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let transport = Transport::open();
     let config = &transport.learner.config;
-    let network = Network::new(
-        &transport.learner.snapshot(),
-        &SnapshotLayout::of(config),
-        config.vae.encoder_precision,
-    );
+    let network = Network::new(&transport.learner.snapshot(), &SnapshotLayout::of(config));
     let courses = Arc::new(Courses::of_run(config).expect("shipped courses can be flown"));
     let tickets = [ticket(transport.learner.identity.run, 1, 1)];
-    let mut pilot = Pilot::new(
+    let mut environment_loop = EnvironmentLoop::new(
         ACTOR,
         INCARNATION,
         Simulators::new(Arc::clone(&courses)),
-        Agent::new(config.view()),
+        Agent::new(config.observation_layout()),
     );
-    let flights: Vec<Vec<TransitionRecord>> = tickets
+    let episodes: Vec<Vec<TransitionRecord>> = tickets
         .iter()
         .map(|ticket| {
-            fly(&mut pilot, ticket, &network, &transport);
+            fly(&mut environment_loop, ticket, &network, &transport);
             transport.received()
         })
         .collect();
-    let steps = flights.iter().map(|records| records.len() - 1).sum::<usize>();
+    let steps = episodes
+        .iter()
+        .map(|records| records.len() - 1)
+        .sum::<usize>();
 
     let mut group = criterion.benchmark_group("actor_step");
     group.throughput(Throughput::Elements(steps as u64));
     group.bench_function("whole", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, flights.len(), &transport, |flight| {
-                fly(&mut pilot, &tickets[flight], &network, &transport);
+            timed(iterations, episodes.len(), &transport, |episode| {
+                fly(
+                    &mut environment_loop,
+                    &tickets[episode],
+                    &network,
+                    &transport,
+                );
             })
         });
     });
-    environment(&mut group, &tickets, &flights, &mut Simulators::new(courses));
-    inference(&mut group, &flights, &network, &config.view());
-    sending(&mut group, &tickets, &flights, &transport);
+    environment(
+        &mut group,
+        &tickets,
+        &episodes,
+        &mut Simulators::new(courses),
+    );
+    inference(
+        &mut group,
+        &episodes,
+        &network,
+        &config.observation_layout(),
+    );
+    sending(&mut group, &tickets, &episodes, &transport);
     group.finish();
     criterion.final_summary();
 }
 
-fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, transport: &Transport) {
-    let flown = pilot.fly(ticket, network, &mut Link(&transport.actor));
-    black_box(flown.expect("memory is free, as all records were taken in"));
+fn fly(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+    network: &Network,
+    transport: &Transport,
+) {
+    let flown = environment_loop.fly(ticket, network, &mut Link(&transport.actor));
+    black_box(flown.expect("memory is free, because all records were read"));
 }
 
-/// Take-off, physics and camera: the same starts and actions.
+/// Reset, physics and camera, with the same starts and actions.
 fn environment(
     group: &mut BenchmarkGroup<'_, WallTime>,
     tickets: &[Ticket],
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     simulators: &mut Simulators,
 ) {
     let mut image = [0; IMAGE_PIXELS];
     group.bench_function("environment", |bencher| {
         bencher.iter(|| {
-            for (ticket, records) in tickets.iter().zip(flights) {
+            for (ticket, records) in tickets.iter().zip(episodes) {
                 let simulator = simulators.of(ticket).expect("the course is loaded");
                 let [mut start, mut disturbances] = [Purpose::StartPosition, Purpose::Disturbances]
                     .map(|purpose| Pcg64Mcg::seed_from_u64(derive(ticket.seed, purpose, 0)));
                 simulator
                     .reset(ticket.start_level, &mut start, &mut disturbances)
-                    .expect("it has this level");
+                    .expect("the course has this level");
                 simulator.render(&mut image);
                 for record in steps_of(records) {
-                    black_box(simulator.step(record.action).expect("the flight was flown before"));
+                    black_box(
+                        simulator
+                            .step(record.action)
+                            .expect("the episode was flown before"),
+                    );
                     simulator.render(&mut image);
                     black_box(&image);
                 }
@@ -108,28 +134,37 @@ fn environment(
     });
 }
 
-/// Encoder and policy: the same images and observations.
+/// Encoder and policy, with the same images and observations.
 fn inference(
     group: &mut BenchmarkGroup<'_, WallTime>,
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     network: &Network,
-    view: &View,
+    observation_layout: &ObservationLayout,
 ) {
     let mut scratch = Scratch::default();
     group.bench_function("encoder", |bencher| {
         bencher.iter(|| {
-            for record in flights.iter().flatten() {
+            for record in episodes.iter().flatten() {
                 black_box(network.encode(black_box(&record.depth), &mut scratch));
             }
         });
     });
     let mut noise = Pcg64Mcg::seed_from_u64(3);
-    let mut observed = vec![0.0; view.len()];
+    let mut observed = vec![0.0; observation_layout.len()];
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
-            for record in flights.iter().flat_map(|records| steps_of(records)) {
-                view.write_moment(&record.latent, &record.velocity_mps, &[0.0; ACTION], &mut observed);
-                black_box(network.distribution(&observed, &mut scratch).sample(&mut noise));
+            for record in episodes.iter().flat_map(|records| steps_of(records)) {
+                observation_layout.write_step(
+                    &record.latent,
+                    &record.velocity_mps,
+                    &[0.0; ACTION],
+                    &mut observed,
+                );
+                black_box(
+                    network
+                        .distribution(&observed, &mut scratch)
+                        .sample(&mut noise),
+                );
             }
         });
     });
@@ -139,21 +174,29 @@ fn inference(
 fn sending(
     group: &mut BenchmarkGroup<'_, WallTime>,
     tickets: &[Ticket],
-    flights: &[Vec<TransitionRecord>],
+    episodes: &[Vec<TransitionRecord>],
     transport: &Transport,
 ) {
     let begin = |ticket: &Ticket, step| {
-        let mut record = transport.actor.loan_transition().expect("all records were taken in");
+        let mut record = transport
+            .actor
+            .loan_transition()
+            .expect("all records were read");
         record.begin(ticket, ACTOR, INCARNATION, step);
         record
     };
-    let send = |record| transport.actor.send_transition(record).expect("the learner is there");
+    let send = |record| {
+        transport
+            .actor
+            .send_transition(record)
+            .expect("the learner exists")
+    };
     group.bench_function("sending", |bencher| {
         bencher.iter_custom(|iterations| {
-            timed(iterations, flights.len(), transport, |flight| {
-                let mut record = begin(&tickets[flight], 0);
-                for step in 1..flights[flight].len() as u32 {
-                    let next = begin(&tickets[flight], step);
+            timed(iterations, episodes.len(), transport, |episode| {
+                let mut record = begin(&tickets[episode], 0);
+                for step in 1..episodes[episode].len() as u32 {
+                    let next = begin(&tickets[episode], step);
                     send(std::mem::replace(&mut record, next));
                 }
                 send(record);
@@ -162,13 +205,19 @@ fn sending(
     });
 }
 
-/// Time that `work` takes on all of so many flights, `iterations` times; the learner's end is emptied after each, at nobody's cost.
-fn timed(iterations: u64, flights: usize, transport: &Transport, mut work: impl FnMut(usize)) -> Duration {
+/// Returns the time of `work` on all episodes, `iterations` times. The learner's buffer is emptied
+/// after each, outside the measured time.
+fn timed(
+    iterations: u64,
+    episodes: usize,
+    transport: &Transport,
+    mut work: impl FnMut(usize),
+) -> Duration {
     let mut spent = Duration::ZERO;
     for _ in 0..iterations {
-        for flight in 0..flights {
+        for episode in 0..episodes {
             let start = Instant::now();
-            work(flight);
+            work(episode);
             spent += start.elapsed();
             transport.empty();
         }
@@ -177,10 +226,12 @@ fn timed(iterations: u64, flights: usize, transport: &Transport, mut work: impl 
 }
 
 fn steps_of(records: &[TransitionRecord]) -> impl Iterator<Item = &TransitionRecord> {
-    records.iter().filter(|record| record.kind == RecordKind::Step.code())
+    records
+        .iter()
+        .filter(|record| record.kind == RecordKind::Step.code())
 }
 
-/// Both ends of a run's services, on one thread.
+/// Ports of actor and learner, on one thread.
 struct Transport {
     actor: ActorPorts,
     learner: Learner,
@@ -189,8 +240,12 @@ struct Transport {
 impl Transport {
     fn open() -> Self {
         let learner = Learner::open();
-        let actor = ActorPorts::join(&learner.identity, &learner.config).expect("the learner is there");
-        learner.ports.maintain().expect("the actor's memory can be mapped");
+        let actor =
+            ActorPorts::join(&learner.identity, &learner.config).expect("the learner exists");
+        learner
+            .ports
+            .maintain()
+            .expect("the actor's memory can be mapped");
         Self { actor, learner }
     }
 

@@ -1,14 +1,7 @@
-//! The actor: flies against tickets and sends back what it saw.
+//! The actor: a process that flies tickets and sends the records.
 //!
-//! Begin with [`environment_loop`]: a flight from its ticket to its closing record. [`service`] is the life of the process around it, [`evaluation`] the
-//! same flights without a learner. There is no libtorch here: inference is native ([`skein_inference`]), so an actor is a small program that starts at once.
+//! Episodes are flown by [`skein_rollout`]; [`service`] is the process around it,
+//! [`snapshot_cache`] the cache of its snapshots.
 
-pub mod agent;
-pub mod courses;
-pub mod environment_loop;
-pub mod evaluation;
-pub mod recording;
 pub mod service;
-#[cfg(test)]
-mod testing;
-pub mod weights;
+pub mod snapshot_cache;

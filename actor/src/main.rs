@@ -8,31 +8,35 @@ use std::sync::atomic::AtomicBool;
 use anyhow::Context;
 use clap::Parser;
 use signal_hook::consts::{SIGINT, SIGTERM};
-use skein_actor::agent::Agent;
-use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::Pilot;
-use skein_actor::service::{Ending, Service};
+use skein_actor::service::{ExitReason, Service};
 use skein_kernels::Isa;
-use skein_protocol::allocation::return_large_blocks;
-use skein_protocol::failure::{EXIT_LEARNER_GONE, with_causes};
-use skein_protocol::ids::{ActorId, Incarnation};
-use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::{Presence, RunDirectory};
-use skein_simulator::camera::Instructions;
+use skein_protocol::ids::{ActorId, ActorIncarnation};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
+use skein_rollout::environment_loop::EnvironmentLoop;
+use skein_run::allocation::return_large_blocks;
+use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
+use skein_run::logging::{LogFormat, log_to_file};
+use skein_run::note;
+use skein_run::signals::is_ignored;
+use skein_run::{Presence, RunDirectory};
+use skein_simulator::camera::InstructionSet;
 use tracing::{error, info};
 
-/// Flies for a run, beside its learner and other actors, until the run is over.
+/// Flies episodes for a run, until the run is over.
 ///
-/// Actors come and go as they like: what is learned does not depend on them. One whose learner dies waits for the learner's next life. The log goes to
-/// logs/actor-ID.log in the run's directory (RUST_LOG says what is logged, SKEIN_LOG_FORMAT=json how). Exit status: 0 when the run is over or on SIGTERM
-/// or SIGINT, 1 on an error, 3 when no learner gave a sign of life for transport.learner_silence_secs.
+/// Actors may join and leave at any time: the result does not depend on them. If the learner dies,
+/// an actor waits for its next incarnation. The log is logs/actor-ID.log in the run's directory
+/// (RUST_LOG filters it, SKEIN_LOG_FORMAT=json sets its format). Exit status: 0 when the run is
+/// over or on SIGTERM or SIGINT, 1 on an error, 3 when no learner sent a heartbeat for
+/// transport.learner_silence_secs.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
     /// Directory of the run.
     #[arg(long, value_name = "DIR")]
     run: PathBuf,
-    /// Number of this actor, unique within the run; by default the first that is free.
+    /// Number of this actor, unique within the run; by default the lowest free one.
     #[arg(long, value_name = "ID")]
     id: Option<u32>,
 }
@@ -40,27 +44,28 @@ struct Arguments {
 fn main() -> ExitCode {
     return_large_blocks();
     match run(&Arguments::parse()) {
-        Ok(Ending::Stopped | Ending::Signalled) => ExitCode::SUCCESS,
-        Ok(Ending::LearnerSilent) => {
-            eprintln!(
-                "skein-actor: no learner of this run gave a sign of life for transport.learner_silence_secs; leaving"
+        Ok(ExitReason::Stopped | ExitReason::Signalled) => ExitCode::SUCCESS,
+        Ok(ExitReason::LearnerSilent) => {
+            note!(
+                "skein-actor: no learner of this run sent a heartbeat for \
+                transport.learner_silence_secs; exiting"
             );
             ExitCode::from(EXIT_LEARNER_GONE)
         }
         Err(error) => {
             let error = with_causes(error.as_ref());
             error!(error, "actor failed");
-            eprintln!("skein-actor: {error}");
+            note!("skein-actor: {error}");
             ExitCode::FAILURE
         }
     }
 }
 
-fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
-    let told_to_end = end_on_signal()?;
+fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
+    let exit_requested = end_on_signal()?;
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
-    // Whoever gave the number holds the claim to it.
+    // The process that chose the number holds the claim to it.
     let (actor, _claim) = match arguments.id {
         Some(id) => (ActorId(id), None),
         None => {
@@ -69,26 +74,35 @@ fn run(arguments: &Arguments) -> anyhow::Result<Ending> {
         }
     };
     let log = directory.actor_log(actor);
-    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
+    log_to_file(&log, LogFormat::from_environment())
+        .with_context(|| format!("cannot write {}", log.display()))?;
 
-    let (isa, camera) = (Isa::best(), Instructions::best());
-    let encoder = config.vae.encoder_precision;
-    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, %encoder, "actor started");
+    let (isa, camera) = (Isa::best(), InstructionSet::best());
+    info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, "actor started");
     let _presence = Presence::enter(&identity)?;
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
-    // Each learner that is joined gives it an incarnation.
-    let mut pilot = Pilot::new(actor, Incarnation(0), simulators, Agent::new(config.view()));
-    Ok(Service::new(&identity, &config, actor, &told_to_end).serve(&mut pilot)?)
+    // Each join assigns a new incarnation.
+    let mut environment_loop = EnvironmentLoop::new(
+        actor,
+        ActorIncarnation(0),
+        simulators,
+        Agent::new(config.observation_layout()),
+    );
+    Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
 }
 
-/// A flag that the first SIGTERM or SIGINT sets; a second one ends the process on the spot.
+/// Returns a flag that the first SIGTERM or SIGINT sets; a second one ends the process at once. One
+/// that was ignored when this process started stays ignored.
 fn end_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
-    let told_to_end = Arc::new(AtomicBool::new(false));
+    let exit_requested = Arc::new(AtomicBool::new(false));
     for signal in [SIGTERM, SIGINT] {
+        if is_ignored(signal) {
+            continue;
+        }
         // In this order: the second signal finds the flag set by the first.
-        signal_hook::flag::register_conditional_default(signal, Arc::clone(&told_to_end))
-            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&told_to_end)))
+        signal_hook::flag::register_conditional_default(signal, Arc::clone(&exit_requested))
+            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&exit_requested)))
             .context("cannot listen for SIGTERM and SIGINT")?;
     }
-    Ok(told_to_end)
+    Ok(exit_requested)
 }

@@ -1,10 +1,10 @@
-//! The life of an actor process: join the learner, take a ticket, fly it, until the run is over.
+//! The actor process: joins the learner, takes a ticket, flies it, until the run is over.
 //!
-//! Whatever happens on the way is survived by doing nothing about it: a flight that is lost is flown again on a new ticket, by this actor or another; a
-//! learner that is lost is looked for until it lives again. Only the end of the run, a signal, or no sign of life from any learner for too long end the
-//! process.
+//! It recovers from failures by starting over: a lost episode is flown again on a new ticket, by
+//! this actor or another; a lost learner is looked for until it is back. The process ends only at
+//! the end of the run, on a signal, or after a long time without a heartbeat from any learner.
 
-mod line;
+mod connection;
 #[cfg(test)]
 mod tests;
 
@@ -13,118 +13,143 @@ use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
-use skein_protocol::ids::{ActorId, Incarnation};
-use skein_protocol::run::{Life, RunIdentity};
-use skein_protocol::services::{ActorPorts, JoinError, ServiceError};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::status::ActorState;
 use skein_protocol::ticket::Ticket;
+use skein_run::fault::{FaultPoint, die_if_armed};
+use skein_run::{LearnerIncarnation, RunIdentity};
+use skein_transport::{ActorPorts, JoinError, ServiceError};
 use tracing::{debug, info, info_span, warn};
 
-use self::line::LearnerLine;
-use crate::environment_loop::{FlightError, Pilot};
+use self::connection::LearnerConnection;
 use skein_inference::Network;
+use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
 
-/// Longest time between two looks for a learner, and between two looks whether to end meanwhile.
-const SEEK_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest time between two tries to join a learner, and between two checks of the exit request
+/// meanwhile.
+const JOIN_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Serves the learners of a run, one life after the other.
+/// Serves the learners of a run, one incarnation after the other.
 #[derive(Debug)]
 pub struct Service<'a> {
     identity: &'a RunIdentity,
     config: &'a Config,
     actor: ActorId,
-    /// Looked at between two steps and between two looks for a learner.
-    told_to_end: &'a AtomicBool,
-    incarnation: Incarnation,
-    /// When a learner last gave a sign of life; at first, when this service began.
-    last_sign: Instant,
-    newest_life: Option<Life>,
+    /// Checked between two steps and between two tries to join.
+    exit_requested: &'a AtomicBool,
+    incarnation: ActorIncarnation,
+    /// Time of the last heartbeat from a learner; at first, the start of this service.
+    last_heard: Instant,
+    newest_learner: Option<LearnerIncarnation>,
 }
 
-/// Why an actor leaves.
+/// Reason why an actor exits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Ending {
-    /// The learner said that the run is over.
+pub enum ExitReason {
+    /// The learner reported the end of the run.
     Stopped,
-    /// This process was told to end.
+    /// This process received a signal.
     Signalled,
-    /// No learner of this run gave a sign of life for `transport.learner_silence_secs`.
+    /// No learner of this run sent a heartbeat for `transport.learner_silence_secs`.
     LearnerSilent,
 }
 
-/// Why an actor lets go of the learner it has joined.
+/// Reason why an actor disconnects from a learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Parting {
-    /// The actor leaves.
-    Leave(Ending),
-    /// That learner is dead, or another life of it has begun.
+enum DisconnectReason {
+    /// The actor exits.
+    Exit(ExitReason),
+    /// The learner is dead, or its next incarnation has begun.
     LearnerGone,
-    /// This process was stopped for so long that the learner has given it up: its tickets are others' now.
-    Overslept,
-    /// The learner hears nothing of what this actor flies.
-    AskedToRejoin,
+    /// This process was suspended for so long that the learner issued its tickets to others.
+    Suspended,
+    /// The learner receives none of this actor's records.
+    RejoinRequested,
 }
 
 impl<'a> Service<'a> {
-    /// A service of `actor` that has not joined a learner yet.
-    pub fn new(identity: &'a RunIdentity, config: &'a Config, actor: ActorId, told_to_end: &'a AtomicBool) -> Self {
+    /// Creates a service of `actor` that has not joined a learner yet.
+    pub fn new(
+        identity: &'a RunIdentity,
+        config: &'a Config,
+        actor: ActorId,
+        exit_requested: &'a AtomicBool,
+    ) -> Self {
         Self {
             identity,
             config,
             actor,
-            told_to_end,
-            incarnation: Incarnation(0),
-            last_sign: Instant::now(),
-            newest_life: None,
+            exit_requested,
+            incarnation: ActorIncarnation(0),
+            last_heard: Instant::now(),
+            newest_learner: None,
         }
     }
 
-    /// Flies tickets as they come, until the run is over for this actor.
+    /// Flies tickets as they arrive, until there is a reason to exit.
     ///
     /// # Errors
-    /// [`JoinError`] when no learner of this run can be joined by this process, now or later, or one that is there could not for
-    /// `transport.learner_silence_secs`. A lost flight or learner is none.
-    pub fn serve(mut self, pilot: &mut Pilot) -> Result<Ending, JoinError> {
+    /// [`JoinError`] if this process can never join a learner of this run, or could not join the
+    /// existing one for `transport.learner_silence_secs`. A lost episode or learner is not an
+    /// error.
+    pub fn serve(
+        mut self,
+        environment_loop: &mut EnvironmentLoop,
+    ) -> Result<ExitReason, JoinError> {
         loop {
-            let ports = match self.seek()? {
+            let ports = match self.find_learner()? {
                 Ok(ports) => ports,
                 Err(ending) => return Ok(ending),
             };
             self.incarnation = next_incarnation(self.incarnation);
-            info!(actor = %self.actor, incarnation = %self.incarnation, life = %ports.life(), "learner joined");
-            pass(FaultPoint::ActorJoined);
-            pilot.begin_life(self.incarnation);
-            let mut line = LearnerLine::new(&self, ports);
-            let parting = serve_life(pilot, &mut line);
-            self.last_sign = line.last_sign();
-            match parting {
-                Ok(Parting::Leave(ending)) => return Ok(ending),
-                Ok(Parting::LearnerGone) => warn!("the learner is gone; looking for its next life"),
-                Ok(Parting::Overslept) => warn!("this process was stopped for too long; joining anew"),
-                Ok(Parting::AskedToRejoin) => warn!("nothing that was flown has arrived; joining anew"),
+            info!(
+                actor = %self.actor,
+                incarnation = %self.incarnation,
+                learner_incarnation = %ports.incarnation(),
+                "learner joined"
+            );
+            die_if_armed(FaultPoint::ActorJoined);
+            environment_loop.begin_incarnation(self.incarnation);
+            let mut connection = LearnerConnection::new(&self, ports);
+            let disconnect_reason = serve_learner(environment_loop, &mut connection);
+            self.last_heard = connection.last_heard();
+            match disconnect_reason {
+                Ok(DisconnectReason::Exit(ending)) => return Ok(ending),
+                Ok(DisconnectReason::LearnerGone) => {
+                    warn!("the learner is gone; looking for its next incarnation")
+                }
+                Ok(DisconnectReason::Suspended) => {
+                    warn!("this process was suspended for too long; joining again")
+                }
+                Ok(DisconnectReason::RejoinRequested) => {
+                    warn!("the learner receives no records; joining again")
+                }
                 Err(error) => {
-                    warn!(%error, "the line to the learner is broken; joining anew");
-                    sleep(SEEK_INTERVAL);
+                    warn!(%error, "the connection to the learner is broken; joining again");
+                    sleep(JOIN_INTERVAL);
                 }
             }
         }
     }
 
-    /// Looks for a learner until it has joined one, or there is a reason to leave.
-    fn seek(&mut self) -> Result<Result<ActorPorts, Ending>, JoinError> {
+    /// Tries to join a learner until it succeeds, or there is a reason to exit.
+    fn find_learner(&mut self) -> Result<Result<ActorPorts, ExitReason>, JoinError> {
         let mut last_refusal = None;
-        let interval = SEEK_INTERVAL.min(self.config.transport.heartbeat());
+        let interval = JOIN_INTERVAL.min(self.config.transport.heartbeat());
         loop {
-            if self.told_to_end.load(Ordering::Relaxed) {
-                return Ok(Err(Ending::Signalled));
+            if self.exit_requested.load(Ordering::Relaxed) {
+                return Ok(Err(ExitReason::Signalled));
             }
             match ActorPorts::join(self.identity, self.config) {
                 Ok(ports) => {
-                    // A life that was not there before shows that a learner lives. To join the same one again shows nothing.
-                    if self.newest_life.is_none_or(|newest| newest < ports.life()) {
-                        self.newest_life = Some(ports.life());
-                        self.last_sign = Instant::now();
+                    // A new incarnation proves that a learner is alive. Joining the same one again
+                    // proves nothing.
+                    if self
+                        .newest_learner
+                        .is_none_or(|newest| newest < ports.incarnation())
+                    {
+                        self.newest_learner = Some(ports.incarnation());
+                        self.last_heard = Instant::now();
                     }
                     return Ok(Ok(ports));
                 }
@@ -135,9 +160,11 @@ impl<'a> Service<'a> {
                         info!(error = refusal, "no learner joined yet");
                         last_refusal = Some(refusal);
                     }
-                    if self.last_sign.elapsed() > Duration::from_secs_f64(self.config.transport.learner_silence_secs) {
+                    if self.last_heard.elapsed()
+                        > Duration::from_secs_f64(self.config.transport.learner_silence_secs)
+                    {
                         return match error {
-                            JoinError::NoLearner(_) => Ok(Err(Ending::LearnerSilent)),
+                            JoinError::NoLearner(_) => Ok(Err(ExitReason::LearnerSilent)),
                             error => Err(error),
                         };
                     }
@@ -148,53 +175,70 @@ impl<'a> Service<'a> {
     }
 }
 
-/// A number that no earlier life of this actor had, as far as the clock tells, and none of this process.
-fn next_incarnation(last: Incarnation) -> Incarnation {
+/// Returns an incarnation that no earlier start of this actor had, as far as the clock shows, and
+/// that is new in this process.
+fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
     let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH);
     let nanos = since_1970.map_or(0, |elapsed| elapsed.as_nanos() as u64);
-    Incarnation(nanos.max(last.0 + 1))
+    ActorIncarnation(nanos.max(last.0 + 1))
 }
 
-/// Serves the learner that was joined.
-fn serve_life(pilot: &mut Pilot, line: &mut LearnerLine<'_>) -> Result<Parting, ServiceError> {
-    line.report(ActorState::Serving)?;
-    let parting = loop {
-        line.listen()?;
-        if let Some(parting) = line.parting() {
-            break parting;
+/// Serves the joined learner.
+fn serve_learner(
+    environment_loop: &mut EnvironmentLoop,
+    connection: &mut LearnerConnection<'_>,
+) -> Result<DisconnectReason, ServiceError> {
+    connection.report(ActorState::Serving)?;
+    let disconnect_reason = loop {
+        connection.listen()?;
+        if let Some(disconnect_reason) = connection.disconnect_reason() {
+            break disconnect_reason;
         }
-        match line.take_ticket() {
-            Some((ticket, network)) => fly(pilot, &ticket, &network, line)?,
-            None => line.wait()?,
+        match connection.take_ticket() {
+            Some((ticket, network)) => fly(environment_loop, &ticket, &network, connection)?,
+            None => connection.wait()?,
         }
     };
-    info!(?parting, flights = line.flights_flown, "leaving");
-    if parting != Parting::LearnerGone {
-        line.report(ActorState::Leaving)?;
+    info!(
+        ?disconnect_reason,
+        episodes = connection.episodes_flown,
+        "disconnecting"
+    );
+    if disconnect_reason != DisconnectReason::LearnerGone {
+        connection.report(ActorState::Leaving)?;
     }
-    Ok(parting)
+    Ok(disconnect_reason)
 }
 
-fn fly(pilot: &mut Pilot, ticket: &Ticket, network: &Network, line: &mut LearnerLine<'_>) -> Result<(), ServiceError> {
-    let span =
-        info_span!("flight", flight = %ticket.flight, attempt = %ticket.attempt, policy = %ticket.policy_version);
+fn fly(
+    environment_loop: &mut EnvironmentLoop,
+    ticket: &Ticket,
+    network: &Network,
+    connection: &mut LearnerConnection<'_>,
+) -> Result<(), ServiceError> {
+    let span = info_span!(
+        "episode",
+        episode = %ticket.episode,
+        attempt = %ticket.attempt,
+        policy = %ticket.policy_version
+    );
     let _entered = span.enter();
-    match pilot.fly(ticket, network, line) {
-        Ok(None) => debug!(steps = ticket.first_step(), "leg flown"),
+    match environment_loop.fly(ticket, network, connection) {
+        Ok(None) => debug!(steps = ticket.first_step(), "segment flown"),
         Ok(Some(score)) => {
-            line.flights_flown += 1;
+            connection.episodes_flown += 1;
             debug!(
                 walls = score.walls_passed,
                 outcome = score.outcome.name(),
-                reward = score.flight_return,
+                reward = score.episode_return,
                 "flown"
             );
         }
-        Err(FlightError::Abandoned) => info!("flight abandoned"),
-        Err(FlightError::Fault(fault)) => warn!(%fault, "flight failed"),
-        // The ticket's deadline makes good for it.
-        Err(FlightError::Link(error)) => warn!(%error, "flight lost"),
+        Err(EpisodeError::Abandoned) => info!("episode abandoned"),
+        Err(EpisodeError::Fault(fault)) => warn!(%fault, "episode failed"),
+        // The ticket's deadline covers it.
+        Err(EpisodeError::Link(error)) => warn!(%error, "episode lost"),
     }
-    // Here, so that the times of a flight that is taken in are known too.
-    line.wake_learner()
+    // Woken here, so that the learner also gets the times of this episode.
+    connection.wake_learner()
 }

@@ -1,34 +1,38 @@
-//! The depth image's bytes are written once: where the camera rendered them, the learner reads them.
+//! Test that the depth image's bytes are written once: the learner reads them where the camera
+//! rendered them.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::sync::Arc;
 
-use skein_actor::agent::Agent;
-use skein_actor::courses::{Courses, Simulators};
-use skein_actor::environment_loop::{Directive, Pilot, RecordLink};
 use skein_inference::Network;
-use skein_protocol::config::{Config, Precision};
-use skein_protocol::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, RunDirectory};
-use skein_protocol::services::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
+use skein_protocol::config::Config;
+use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+use skein_run::{LearnerLock, RunDirectory};
+use skein_transport::{ActorPorts, LearnerPorts, LoanedTransition, ServiceError};
 
-/// A byte of memory, whatever address it is mapped to: a file and an offset in it.
+/// A byte of memory, independent of the address it is mapped to: a file and an offset in it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
+struct FileOffset {
     inode: String,
     offset: usize,
 }
 
-impl Place {
+impl FileOffset {
     fn of(address: *const u8) -> Self {
         let address = address as usize;
         let maps = std::fs::read_to_string("/proc/self/maps").unwrap();
         let number = |text: &str| usize::from_str_radix(text, 16).unwrap();
         // "start-end permissions offset device inode path"
-        let place = maps.lines().find_map(|line| {
+        let location = maps.lines().find_map(|line| {
             let fields: Vec<_> = line.split_whitespace().collect();
             let (start, end) = fields[0].split_once('-')?;
             (number(start) <= address && address < number(end)).then(|| Self {
@@ -36,17 +40,17 @@ impl Place {
                 offset: address - number(start) + number(fields[2]),
             })
         });
-        let place = place.expect("every address of ours is mapped");
-        assert_ne!(place.inode, "0", "memory of one process alone is shared with nobody");
-        place
+        let location = location.expect("every address of this process is mapped");
+        assert_ne!(location.inode, "0", "private memory has no file");
+        location
     }
 }
 
-/// Notes where each image lies, when it is about to be rendered and when it is sent.
+/// Link that records where each image lies, when loaned and when sent.
 struct Watched<'a> {
     ports: &'a ActorPorts,
-    loaned: Vec<Place>,
-    sent: Vec<Place>,
+    loaned: Vec<FileOffset>,
+    sent: Vec<FileOffset>,
 }
 
 impl RecordLink for Watched<'_> {
@@ -55,12 +59,12 @@ impl RecordLink for Watched<'_> {
 
     fn loan(&mut self) -> Result<LoanedTransition, ServiceError> {
         let record = self.ports.loan_transition()?;
-        self.loaned.push(Place::of(record.depth.as_ptr()));
+        self.loaned.push(FileOffset::of(record.depth.as_ptr()));
         Ok(record)
     }
 
     fn send(&mut self, record: LoanedTransition) -> Result<(), ServiceError> {
-        self.sent.push(Place::of(record.depth.as_ptr()));
+        self.sent.push(FileOffset::of(record.depth.as_ptr()));
         self.ports.send_transition(record)
     }
 
@@ -76,13 +80,16 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     let mut config = Config::default();
     config.sac.hidden_width = 8;
     config.transport.max_actors = 1;
-    let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/courses/training.toml");
+    let configs = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../configs/courses/training.toml"
+    );
     config.courses.training = configs.into();
     config.courses.evaluation = vec![configs.into()];
     run.create(&config).unwrap();
     let (identity, config) = run.open().unwrap();
-    let seat = LearnerSeat::take(&run, &identity).unwrap();
-    let learner = LearnerPorts::open(&identity, seat.life(), &config).unwrap();
+    let lock = LearnerLock::take(&run, &identity).unwrap();
+    let learner = LearnerPorts::open(&identity, lock.incarnation(), &config).unwrap();
     let actor = ActorPorts::join(&identity, &config).unwrap();
     learner.maintain().unwrap();
 
@@ -93,27 +100,32 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
     };
     let ticket = Ticket {
         run: identity.run,
-        flight: FlightId(0),
+        episode: EpisodeId(0),
         attempt: Attempt(0),
         policy_version: PolicyVersion(0),
         course: CourseChoice::Training,
         start_level: 1,
         exploration: Exploration::Uniform,
         seed: 5,
-        leg: None,
+        segment: None,
     };
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));
-    let mut pilot = Pilot::new(ActorId(0), Incarnation(0), simulators, Agent::new(config.view()));
+    let mut environment_loop = EnvironmentLoop::new(
+        ActorId(0),
+        ActorIncarnation(0),
+        simulators,
+        Agent::new(config.observation_layout()),
+    );
     let mut watched = Watched {
         ports: &actor,
         loaned: Vec::new(),
         sent: Vec::new(),
     };
-    let flown = pilot.fly(&ticket, &Network::new(&snapshot, &layout, Precision::F32), &mut watched);
+    let flown = environment_loop.fly(&ticket, &Network::new(&snapshot, &layout), &mut watched);
 
     let mut received = Vec::new();
     while let Some(record) = learner.receive_transition().unwrap() {
-        received.push(Place::of(record.depth.as_ptr()));
+        received.push(FileOffset::of(record.depth.as_ptr()));
     }
     flown.unwrap();
     assert!(received.len() > 3);

@@ -1,40 +1,55 @@
-//! What the user is told at the end of a run: the evaluation, where the time went, and where everything lies.
+//! Summary at the end of a run: its evaluation, where the time went, and where its files are.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
+use skein_protocol::config::EvaluationSection;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::RunDirectory;
-use skein_protocol::stages::Times;
-use skein_protocol::summary::{Ending, Summary, Trained};
+use skein_protocol::stages::StageTimes;
+use skein_protocol::summary::{RunEnding, Summary, Trained};
+use skein_run::RunDirectory;
+use skein_run::tables::{evaluation_table, stages_table};
 
-use crate::display::Clock;
+use skein_reports::Clock;
 
-/// The evaluation table, the run in one sentence, the table of where the time went, and the paths of everything it left, for standard output. What a run did not come to write is left out.
-pub fn conclusion(run: &RunDirectory) -> String {
+/// Returns the evaluation table, a sentence on the run, the table of times per stage, and the paths
+/// of all files the run left, for standard output of `columns`. Parts that the run did not write
+/// are left out.
+pub fn conclusion(run: &RunDirectory, columns: usize) -> String {
     let mut text = String::new();
     if let Some(report) = read::<EvaluationReport>(&run.evaluation_json()) {
         push(
             &mut text,
             &format!(
-                "Best snapshot (version {}), flown without exploration:\n{report}\n",
-                report.policy_version
+                "Best snapshot (version {}), flown without exploration:\n{}\n",
+                report.policy_version,
+                evaluation_table(&report, columns)
             ),
         );
     }
-    if let Some(summary) = Summary::of(run) {
+    if let Some(summary) = run.summary() {
         if let Some(trained) = &summary.trained {
             push(&mut text, &trained_sentence(trained));
         }
         push(&mut text, &sentence(&summary));
-        if summary.stages != Times::default() {
-            push(&mut text, &format!("{}\n", summary.stages));
+        if let Some(reason) = &summary.untrained {
+            push(&mut text, &format!("{reason}\n"));
+        }
+        if summary.stages != StageTimes::default() {
+            push(
+                &mut text,
+                &format!("{}\n", stages_table(&summary.stages, columns)),
+            );
         }
     }
     push(&mut text, &format!("{}:", run.root().display()));
     for (path, meaning) in artefacts(run) {
-        let shown = path.strip_prefix(run.root()).unwrap_or(&path).display().to_string();
+        let shown = path
+            .strip_prefix(run.root())
+            .unwrap_or(&path)
+            .display()
+            .to_string();
         push(&mut text, &format!("  {shown:<30} {meaning}"));
     }
     text
@@ -49,11 +64,31 @@ fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
 }
 
 fn trained_sentence(trained: &Trained) -> String {
+    let flown = trained.confirmation_episodes;
+    let (flown, remark) = match flown {
+        // Written by a version that did not record it.
+        0 => ("".to_owned(), ""),
+        1 => (
+            "1 ".to_owned(),
+            " One says little: raise evaluation.confirm_episodes.",
+        ),
+        few if few < EvaluationSection::FEW_EPISODES => (
+            format!("{few} "),
+            " So few say little: raise evaluation.confirm_episodes.",
+        ),
+        enough => (format!("{enough} "), ""),
+    };
     format!(
-        "Trained after {}: R {:.3} in evaluation flights after {} flights, {} steps, {} updates.",
+        "Trained after {}: R (share of walls passed) {:.3} in {flown}evaluation episode{}, \
+         after {} episodes, {} steps, {} updates.{remark}",
         Clock(trained.wall_secs),
         trained.rate,
-        trained.flights,
+        if trained.confirmation_episodes == 1 {
+            ""
+        } else {
+            "s"
+        },
+        trained.episodes,
         trained.steps,
         trained.updates
     )
@@ -61,43 +96,65 @@ fn trained_sentence(trained: &Trained) -> String {
 
 fn sentence(summary: &Summary) -> String {
     let ending = match summary.ending {
-        Ending::Completed => "Completed",
-        Ending::Interrupted => "Interrupted",
+        RunEnding::Completed => "Completed",
+        RunEnding::Interrupted => "Interrupted",
     };
     format!(
-        "{ending} after {}: {} flights, {} steps, {} updates, {} VAE updates. Final policy (version {}): {}.\n",
+        "{ending} after {}: {} episodes, {} steps, {} updates, {} VAE updates. \
+             Final policy (version {}): {}.\n",
         Clock(summary.wall_secs),
-        summary.flights,
+        summary.episodes,
         summary.steps,
         summary.updates,
         summary.vae_updates,
         summary.final_version,
-        summary.policy_sha256.get(..16).unwrap_or(&summary.policy_sha256)
+        summary
+            .policy_sha256
+            .get(..16)
+            .unwrap_or(&summary.policy_sha256)
     )
 }
 
-/// What is there, and what it is.
+/// Returns the files that exist, each with its meaning.
 fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     let plot = |name: &str| run.plots().join(name);
     [
         (run.config(), "the resolved configuration"),
-        (run.courses(), "the courses flown"),
-        (run.flights_csv(), "one row per training flight"),
+        (run.courses(), "courses of the run"),
+        (run.episodes_csv(), "one row per training episode"),
         (run.evaluation_json(), "the evaluation above"),
-        (run.evaluation_paths_csv(), "where its flights flew"),
-        (run.summary_json(), "counts, times above, policy_sha256"),
-        (plot("return.png"), "return over the training flights"),
-        (plot("walls_passed.png"), "walls passed over the training flights"),
+        (
+            run.evaluation_trajectories_csv(),
+            "trajectories of the evaluation episodes",
+        ),
+        (run.summary_json(), "counts, times per stage, policy_sha256"),
+        (plot("return.png"), "return of the training episodes"),
+        (
+            plot("walls_passed.png"),
+            "walls passed by the training episodes",
+        ),
         (
             plot("reconstructions.png"),
-            "depth images and what the VAE makes of them",
+            "depth images and their VAE reconstructions",
         ),
-        (plot("flight_paths.png"), "evaluation flights through the walls"),
-        (run.best_snapshot(), "the best snapshot: launch/evaluate.sh --run DIR"),
+        (
+            plot("trajectories.png"),
+            "trajectories of the evaluation episodes",
+        ),
+        (
+            run.best_snapshot(),
+            "the best snapshot; fly it: launch/evaluate.sh --run DIR",
+        ),
         (run.latest_snapshot(), "the last snapshot"),
-        (run.checkpoints(), "everything the learner knew"),
-        (run.tensorboard(), "curves: tensorboard --logdir DIR"),
-        (run.logs(), "a log for each process"),
+        (
+            run.checkpoints(),
+            "full state of the learner, to resume from",
+        ),
+        (
+            run.tensorboard(),
+            "training curves: tensorboard --logdir DIR",
+        ),
+        (run.logs(), "one log per process"),
     ]
     .into_iter()
     .filter(|(path, _)| path.exists())
@@ -117,7 +174,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_finished_run_is_told_with_its_table_and_paths() {
+    fn the_conclusion_of_a_finished_run_has_its_table_and_paths() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         let report = EvaluationReport {
@@ -125,29 +182,31 @@ mod tests {
             policy_sha256: "00".to_owned(),
             courses: vec![CourseEvaluation::of("training", 5, &[])],
         };
-        let mut stages = Times::default();
+        let mut stages = StageTimes::default();
         stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));
         let summary = Summary {
             skein_version: "0".to_owned(),
             run: RunId(1),
             seed: 1,
-            ending: Ending::Completed,
+            ending: RunEnding::Completed,
             policy_sha256: "0123456789abcdef0000".to_owned(),
             final_version: PolicyVersion(50),
             best_version: None,
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.93,
-                flights: 90,
+                confirmation_episodes: 20,
+                episodes: 90,
                 steps: 1800,
                 updates: 270,
                 wall_secs: 61.0,
             }),
-            flights: 100,
+            untrained: None,
+            episodes: 100,
             steps: 2000,
             updates: 300,
             vae_updates: 40,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
             tickets_reissued: 0,
             records_refused: 0,
             reissued_by_reason: Default::default(),
@@ -157,28 +216,60 @@ mod tests {
             stages,
             thread_cpu_secs: BTreeMap::new(),
         };
-        fs::write(run.evaluation_json(), serde_json::to_string(&report).unwrap()).unwrap();
+        fs::write(
+            run.evaluation_json(),
+            serde_json::to_string(&report).unwrap(),
+        )
+        .unwrap();
         fs::write(run.summary_json(), serde_json::to_string(&summary).unwrap()).unwrap();
-        let text = conclusion(&run);
+        let text = conclusion(&run, usize::MAX);
         for part in [
             "version 42",
             "training",
-            "Trained after 1:01: R 0.930 in evaluation flights after 90 flights, 1800 steps",
-            "Completed after 1:15: 100 flights, 2000 steps",
+            "Trained after 1:01: R (share of walls passed) 0.930 in 20 evaluation episodes, \
+             after 90 episodes, 1800",
+            "Completed after 1:15: 100 episodes, 2000 steps",
             "│ actors, together    ┆ encoder ┆  2000 ┆ 1.50 s ┆ 750.00 µs ┆ 100.0 % │",
             "summary.json",
         ] {
             assert!(text.contains(part), "`{part}` is missing in\n{text}");
         }
         assert!(
-            !text.contains("flights.csv"),
-            "what is not there is not listed:\n{text}"
+            !text.contains("episodes.csv"),
+            "a file that does not exist is not listed:\n{text}"
         );
     }
 
     #[test]
-    fn a_run_that_left_nothing_has_a_conclusion_still() {
+    fn the_sentence_on_success_says_on_how_many_episodes_it_rests() {
+        let sentence = |confirmation_episodes| {
+            trained_sentence(&Trained {
+                rate: 1.0,
+                confirmation_episodes,
+                episodes: 50,
+                steps: 900,
+                updates: 50,
+                wall_secs: 9.0,
+            })
+        };
+        let three = sentence(3);
+        assert!(
+            three.contains("1.000 in 3 evaluation episodes,")
+                && three.contains("evaluation.confirm_episodes"),
+            "{three}"
+        );
+        assert!(sentence(1).contains("1.000 in 1 evaluation episode,"));
+        let enough = sentence(EvaluationSection::FEW_EPISODES);
+        assert!(!enough.contains("confirm_episodes"), "{enough}");
+        assert!(sentence(0).contains("1.000 in evaluation episodes,"));
+    }
+
+    #[test]
+    fn a_run_that_left_nothing_still_has_a_conclusion() {
         let directory = tempfile::tempdir().unwrap();
-        assert!(conclusion(&RunDirectory::new(directory.path())).contains(&directory.path().display().to_string()));
+        assert!(
+            conclusion(&RunDirectory::new(directory.path()), 80)
+                .contains(&directory.path().display().to_string())
+        );
     }
 }

@@ -1,45 +1,55 @@
-//! The progress of a run, on a terminal or in a log.
+//! Progress of a run, on a terminal or in a log.
 //!
-//! A terminal gets a bar with the figures beneath that renew themselves; anything else gets a plain line every few seconds. Both go to
-//! standard error, so that what a run comes to stands alone on standard output.
+//! A terminal gets a progress bar with figures below it, updated in place. Any other output gets a
+//! plain line every few seconds. Both go to standard error, so that standard output holds only the
+//! results.
 
 use std::collections::VecDeque;
 use std::fmt;
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::{LearnerPhase, ProgressReport};
+use skein_reports::Clock;
+use skein_run::note;
+use skein_run::terminal::{can_redraw, stderr_columns, wrapped};
 
 use crate::supervisor::{Restarts, Watcher};
 
-/// Between two plain lines.
+/// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// The pace of the last so many seconds says how long the rest will take: the VAE's part of a run is slower than what follows.
+/// Columns for the bar beside the first line of its text, with the space between.
+const LEAST_BAR: usize = 4;
+/// Time window for the pace from which the remaining time is estimated. A short window matters
+/// because the VAE's part of a run is slower than what follows.
 const PACE_SECS: f64 = 60.0;
 
-/// Shows how a run gets on.
-pub struct Display {
+/// Display of a run's progress.
+pub struct ProgressDisplay {
     surface: Surface,
     pace: Pace,
 }
 
 enum Surface {
     Terminal(ProgressBar),
-    Plain { last: Option<(Instant, Phase)> },
+    Plain {
+        last: Option<(Instant, LearnerPhase)>,
+    },
 }
 
-/// A progress bar, if standard error is a terminal.
-pub(crate) fn bar_on_terminal() -> Option<ProgressBar> {
-    std::io::stderr().is_terminal().then(|| {
-        let style =
-            ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}").expect("the template is well-formed");
-        ProgressBar::new(0).with_style(style.progress_chars("━━─"))
-    })
+/// Returns a progress bar if standard error is a terminal that can show one.
+pub fn bar_on_terminal() -> Option<ProgressBar> {
+    if !can_redraw() {
+        return None;
+    }
+    let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
+        .expect("the template is well-formed");
+    let bar = ProgressBar::new(0).with_style(style.progress_chars("━━─"));
+    (!bar.is_hidden()).then_some(bar)
 }
 
-impl Display {
-    /// A display for this process's standard error.
+impl ProgressDisplay {
+    /// Returns a display for this process's standard error.
     pub fn new() -> Self {
         let surface = bar_on_terminal().map_or(Surface::Plain { last: None }, Surface::Terminal);
         Self {
@@ -48,14 +58,22 @@ impl Display {
         }
     }
 
-    /// Where the run is and how much longer it will take, and the figures that show whether it learns.
-    pub fn text(&mut self, progress: &Progress, restarts: Restarts) -> (String, String) {
+    /// Returns a head line (position in the run and remaining time) and a line of figures that show
+    /// whether the training makes progress.
+    pub fn text(&mut self, progress: &ProgressReport, restarts: Restarts) -> (String, String) {
         let left_secs = self.pace.secs_left(progress);
-        let figures = Figures { progress, restarts };
-        (Head { progress, left_secs }.to_string(), figures.to_string())
+        let figures = ProgressFigures { progress, restarts };
+        (
+            ProgressHead {
+                progress,
+                left_secs,
+            }
+            .to_string(),
+            figures.to_string(),
+        )
     }
 
-    /// Removes the bar, so that other things can be printed.
+    /// Removes the bar, so that other text can be printed.
     pub fn finish(&self) {
         if let Surface::Terminal(bar) = &self.surface {
             bar.finish_and_clear();
@@ -63,33 +81,41 @@ impl Display {
     }
 }
 
-impl Default for Display {
+impl Default for ProgressDisplay {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Watcher for Display {
-    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
+impl Watcher for ProgressDisplay {
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts) {
         let (head, figures) = self.text(progress, restarts);
         match &mut self.surface {
             Surface::Terminal(bar) => {
                 let (position, length) = match progress.phase {
-                    Phase::Evaluating => progress.evaluation_flights,
-                    Phase::Flying | Phase::Learning | Phase::Finishing => (progress.flights, progress.total_flights),
+                    LearnerPhase::Evaluating => progress.evaluation_episodes,
+                    LearnerPhase::Flying | LearnerPhase::Learning | LearnerPhase::Finishing => {
+                        (progress.episodes, progress.total_episodes)
+                    }
                 };
                 bar.set_length(length);
                 bar.set_position(position);
-                bar.set_message(format!("{head}\n{}", wrapped(&figures, terminal_columns())));
+                let columns = stderr_columns();
+                let head = wrapped(&head, columns.saturating_sub(LEAST_BAR));
+                bar.set_message(format!("{head}\n{}", wrapped(&figures, columns)));
             }
             Surface::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
                     when.elapsed() >= LINE_INTERVAL
-                        || (phase == Phase::Evaluating) != (progress.phase == Phase::Evaluating)
+                        || (phase == LearnerPhase::Evaluating)
+                            != (progress.phase == LearnerPhase::Evaluating)
                 });
                 if due {
                     *last = Some((Instant::now(), progress.phase));
-                    eprintln!("{head} · {figures}");
+                    note!(
+                        "{}",
+                        wrapped(&format!("{head} · {figures}"), stderr_columns())
+                    );
                 }
             }
         }
@@ -97,38 +123,45 @@ impl Watcher for Display {
 
     fn warn(&mut self, text: &str) {
         match &self.surface {
-            Surface::Terminal(bar) => bar.suspend(|| eprintln!("skein: {text}")),
-            Surface::Plain { .. } => eprintln!("skein: {text}"),
+            Surface::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
+            Surface::Plain { .. } => note!("skein: {text}"),
         }
     }
 }
 
-/// Where the run is, and how much longer it will take.
-struct Head<'a> {
-    progress: &'a Progress,
+/// Position in the run and remaining time.
+struct ProgressHead<'a> {
+    progress: &'a ProgressReport,
     left_secs: Option<f64>,
 }
 
-impl fmt::Display for Head<'_> {
+impl fmt::Display for ProgressHead<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Progress {
-            flights,
-            total_flights,
+        let ProgressReport {
+            episodes,
+            total_episodes,
             elapsed_secs,
             ..
         } = *self.progress;
         match self.progress.phase {
-            Phase::Evaluating => {
-                let (flown, total) = self.progress.evaluation_flights;
-                let what = if flights < total_flights {
+            LearnerPhase::Evaluating => {
+                let (flown, total) = self.progress.evaluation_episodes;
+                let what = if episodes < total_episodes {
                     " the newest snapshot"
                 } else {
                     ""
                 };
-                write!(f, "evaluating{what} {flown}/{total} · flight {flights}/{total_flights}")?;
+                write!(
+                    f,
+                    "evaluating{what} {flown}/{total} · episode {episodes}/{total_episodes}"
+                )?;
             }
-            Phase::Finishing => write!(f, "finishing · flight {flights}/{total_flights}")?,
-            Phase::Flying | Phase::Learning => write!(f, "flight {flights}/{total_flights}")?,
+            LearnerPhase::Finishing => {
+                write!(f, "finishing · episode {episodes}/{total_episodes}")?
+            }
+            LearnerPhase::Flying | LearnerPhase::Learning => {
+                write!(f, "episode {episodes}/{total_episodes}")?
+            }
         }
         write!(f, " · {}", Clock(elapsed_secs))?;
         match self.left_secs {
@@ -138,13 +171,13 @@ impl fmt::Display for Head<'_> {
     }
 }
 
-/// The figures that show whether it learns, and what it has been through.
-struct Figures<'a> {
-    progress: &'a Progress,
+/// ProgressFigures of the training, and restarts of its processes.
+struct ProgressFigures<'a> {
+    progress: &'a ProgressReport,
     restarts: Restarts,
 }
 
-impl fmt::Display for Figures<'_> {
+impl fmt::Display for ProgressFigures<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let progress = self.progress;
         write!(
@@ -164,7 +197,10 @@ impl fmt::Display for Figures<'_> {
         }
         let plural = if progress.actors == 1 { "" } else { "s" };
         write!(f, " · {} actor{plural}", progress.actors)?;
-        for (who, times) in [("learner", self.restarts.learner), ("actors", self.restarts.actors)] {
+        for (who, times) in [
+            ("learner", self.restarts.learner),
+            ("actors", self.restarts.actors),
+        ] {
             if times > 0 {
                 write!(f, " · {who} restarted {times}×")?;
             }
@@ -176,71 +212,34 @@ impl fmt::Display for Figures<'_> {
     }
 }
 
-/// `figures` on as many lines of at most `columns` as they take, parted where one figure ends: the terminal would part them anywhere, and the bar would
-/// not know how many lines to renew.
-fn wrapped(figures: &str, columns: usize) -> String {
-    let mut lines: Vec<String> = Vec::new();
-    for figure in figures.split(" · ") {
-        match lines.last_mut() {
-            Some(line) if line.chars().count() + 3 + figure.chars().count() <= columns => {
-                line.push_str(" · ");
-                line.push_str(figure);
-            }
-            _ => lines.push(figure.to_owned()),
-        }
-    }
-    lines.join("\n")
-}
-
-/// Columns of the terminal on standard error; of a small one when it does not say.
-fn terminal_columns() -> usize {
-    rustix::termios::tcgetwinsize(std::io::stderr()).map_or(80, |size| match size.ws_col {
-        0 => 80,
-        columns => columns.into(),
-    })
-}
-
-/// A duration as `m:ss` or `h:mm:ss`.
-pub(crate) struct Clock(pub(crate) f64);
-
-impl fmt::Display for Clock {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let secs = self.0.max(0.0).round() as u64;
-        let (hours, minutes, secs) = (secs / 3600, secs / 60 % 60, secs % 60);
-        match hours {
-            0 => write!(f, "{minutes}:{secs:02}"),
-            _ => write!(f, "{hours}:{minutes:02}:{secs:02}"),
-        }
-    }
-}
-
-/// The pace of the training flights over the last [`PACE_SECS`].
+/// Pace of the training episodes over the last [`PACE_SECS`].
 #[derive(Debug, Default)]
 struct Pace {
-    /// Elapsed seconds and flights, oldest first.
+    /// Elapsed seconds and episode counts, oldest first.
     reports: VecDeque<(f64, u64)>,
 }
 
 impl Pace {
-    /// Seconds until all training flights are flown at the present pace; `None` before there is a pace.
-    fn secs_left(&mut self, progress: &Progress) -> Option<f64> {
-        let (now_secs, flights) = (progress.elapsed_secs, progress.flights);
-        // A learner that was started again does some work anew, and is ahead of nobody by it.
+    /// Returns the seconds until all training episodes are flown at the present pace, or `None`
+    /// before a pace is known.
+    fn secs_left(&mut self, progress: &ProgressReport) -> Option<f64> {
+        let (now_secs, episodes) = (progress.elapsed_secs, progress.episodes);
+        // A restarted learner repeats some episodes; they say nothing about the pace.
         if self
             .reports
             .back()
-            .is_some_and(|&(secs, flown)| now_secs < secs || flights < flown)
+            .is_some_and(|&(secs, flown)| now_secs < secs || episodes < flown)
         {
             self.reports.clear();
         }
-        self.reports.push_back((now_secs, flights));
+        self.reports.push_back((now_secs, episodes));
         while self.reports.len() > 2 && self.reports[1].0 < now_secs - PACE_SECS {
             self.reports.pop_front();
         }
         let &(then_secs, flown) = self.reports.front()?;
-        let flights_per_sec = flights.checked_sub(flown)? as f64 / (now_secs - then_secs);
-        let left = progress.total_flights.saturating_sub(flights) as f64;
-        (flights_per_sec > 0.0 && flights_per_sec.is_finite()).then(|| left / flights_per_sec)
+        let episodes_per_sec = episodes.checked_sub(flown)? as f64 / (now_secs - then_secs);
+        let left = progress.total_episodes.saturating_sub(episodes) as f64;
+        (episodes_per_sec > 0.0 && episodes_per_sec.is_finite()).then(|| left / episodes_per_sec)
     }
 }
 
@@ -248,9 +247,9 @@ impl Pace {
 mod tests {
     use super::*;
 
-    fn progress(elapsed_secs: f64, flights: u64) -> Progress {
-        Progress {
-            flights,
+    fn progress(elapsed_secs: f64, episodes: u64) -> ProgressReport {
+        ProgressReport {
+            episodes,
             steps: 10_000,
             updates: 4000,
             vae_updates: 100,
@@ -261,7 +260,7 @@ mod tests {
             actors: 1,
             live_actors: vec![0],
             elapsed_secs,
-            ..Progress::start(2000)
+            ..ProgressReport::start(2000)
         }
     }
 
@@ -270,27 +269,31 @@ mod tests {
         let progress = progress(3725.0, 512);
         let line = format!(
             "{} · {}",
-            Head {
+            ProgressHead {
                 progress: &progress,
                 left_secs: Some(61.0)
             },
-            Figures {
+            ProgressFigures {
                 progress: &progress,
-                restarts: Restarts { learner: 2, actors: 0 },
+                restarts: Restarts {
+                    learner: 2,
+                    actors: 0
+                },
             }
         );
-        let expected = "flight 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
+        let expected = "episode 512/2000 · 1:02:05, 1:01 left · 152 steps/s · 63 updates/s · \
+                        walls passed 1.23 · temperature 0.051 · 1 actor · learner restarted 2×";
         assert_eq!(line, expected);
     }
 
     #[test]
-    fn figures_never_exceed_the_width_of_the_terminal() {
-        let progress = Progress {
+    fn figures_never_exceed_the_terminal_width() {
+        let progress = ProgressReport {
             mean_return: Some(-8.69),
             vae_loss: Some(150.1),
             ..progress(3725.0, 512)
         };
-        let figures = Figures {
+        let figures = ProgressFigures {
             progress: &progress,
             restarts: Restarts {
                 learner: 12,
@@ -298,32 +301,47 @@ mod tests {
             },
         }
         .to_string();
+        let head = ProgressHead {
+            progress: &progress,
+            left_secs: Some(61.0),
+        }
+        .to_string();
+        for columns in 1..200 {
+            let lines = wrapped(&format!("{head} · {figures}"), columns);
+            assert!(
+                lines.lines().all(|line| line.chars().count() <= columns),
+                "{lines}"
+            );
+        }
         for columns in 30..200 {
             let lines = wrapped(&figures, columns);
-            assert!(lines.lines().all(|line| line.chars().count() <= columns), "{lines}");
+            assert!(
+                lines.lines().all(|line| line.chars().count() <= columns),
+                "{lines}"
+            );
             assert_eq!(lines.replace('\n', " · "), figures);
         }
         assert!(!wrapped(&figures, figures.chars().count()).contains('\n'));
     }
 
     #[test]
-    fn a_learner_that_was_started_again_has_a_pace_of_its_own() {
+    fn the_pace_starts_afresh_with_a_restarted_learner() {
         let mut pace = Pace::default();
-        for second in 0..100 {
-            pace.secs_left(&progress(f64::from(second), 100 * second as u64 / 10));
+        for second in 0..100_u32 {
+            pace.secs_left(&progress(f64::from(second), 100 * u64::from(second) / 10));
         }
         assert_eq!(pace.secs_left(&progress(0.5, 500)), None);
         assert_eq!(pace.secs_left(&progress(10.5, 600)), Some(140.0));
     }
 
     #[test]
-    fn time_left_follows_the_present_pace() {
+    fn remaining_time_follows_the_present_pace() {
         let mut pace = Pace::default();
         assert_eq!(pace.secs_left(&progress(0.0, 0)), None);
         assert_eq!(pace.secs_left(&progress(10.0, 100)), Some(190.0));
-        // Ten times slower from here on: after a minute the first seconds are forgotten.
-        for second in 11..=200 {
-            pace.secs_left(&progress(f64::from(second), 100 + (second as u64 - 10)));
+        // Ten times slower from here on. After a minute the first seconds no longer count.
+        for second in 11..=200_u32 {
+            pace.secs_left(&progress(f64::from(second), 100 + (u64::from(second) - 10)));
         }
         let left = pace.secs_left(&progress(201.0, 291)).unwrap();
         assert!((left - 1709.0).abs() < 1.0, "{left}");

@@ -1,18 +1,13 @@
-//! Starts, watches and stops the processes of a run, shows their progress, and draws what they leave behind.
+//! Starts, watches and stops the processes of a run, and shows their progress.
 //!
-//! A run is prepared ([`prepare`](mod@prepare)) or taken up again ([`resume`](mod@resume)), supervised ([`supervisor`]) under the eyes of a [`display`], drawn ([`reports`]) and told
-//! ([`conclusion`](mod@conclusion)), in this order; [`benchmarks`] are told in a table of their own. [`experiments`] are many runs, each by a
-//! `skein run` of its own. The supervisor knows the learner and the actors as programs only: it shares no memory with them,
-//! so that nothing that happens to them can harm it.
+//! A run is prepared (`skein-prepare`) or resumed ([`resume`](mod@resume)), supervised
+//! ([`supervisor`]) while a [`display`] shows its progress, drawn (`skein-reports`) and summarised
+//! ([`conclusion`](mod@conclusion)), in this order. An experiment (`skein-experiments`) is many
+//! runs, each started as a separate `skein run`. The supervisor knows the learner and the actors
+//! only as programs. It shares no memory with them, so their failures cannot harm it.
 
-pub mod benchmarks;
 pub mod conclusion;
 pub mod display;
-pub mod experiments;
-pub mod inspection;
 pub mod interrupts;
-pub mod orphans;
-pub mod prepare;
-pub mod reports;
 pub mod resume;
 pub mod supervisor;

@@ -1,281 +1,255 @@
-//! `skein`: runs a training, adds actors to one, draws what one left.
+//! `skein`: the front door. Runs a training, adds actors to one, draws what one left; evaluates and
+//! experiments.
 
+mod cli;
+mod experiment;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use clap::error::ErrorKind;
-use clap::{Args, CommandFactory, Parser, Subcommand};
+use clap::Parser;
 use rustix::fs::Mode;
 use rustix::process::umask;
 use skein_launch::conclusion::conclusion;
-use skein_launch::display::Display;
-use skein_launch::interrupts::{INTERRUPTED, interrupts, runtime};
-use skein_launch::prepare::room::{check_shared_memory_for_more, scarce_disk};
-use skein_launch::prepare::{Prepared, ideal_walls_passed, load_courses, prepare};
-use skein_launch::reports;
+use skein_launch::display::ProgressDisplay;
+use skein_launch::interrupts::{interrupts, runtime};
 use skein_launch::resume::resume;
-use skein_launch::supervisor::{self, Deadlines, Ended, Plan, Programs, SupervisorError};
-use skein_protocol::claims::ActorClaim;
-use skein_protocol::failure::with_causes;
-use skein_protocol::run::{RunDirectory, RunError, SupervisorSeat, sweep_leftovers};
-use skein_protocol::summary::{Ending, Summary};
+use skein_launch::supervisor::{
+    self, Deadlines, Ended, Programs, SupervisionPlan, SupervisorError,
+};
+use skein_prepare::room::{check_shared_memory_for_more, raise_file_limit, scarce_disk};
+use skein_prepare::{NewDirectory, Prepared, prepare};
+use skein_protocol::config::{Config, CoursesSection, EvaluationSection};
+use skein_protocol::summary::RunEnding;
+use skein_reports::{ideal_walls_passed, load_courses};
+use skein_run::ActorClaim;
+use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
+use skein_run::logging::environment_faults;
+use skein_run::terminal::{quoted, stdout_columns};
+use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
+use skein_run::{note, show};
 
-/// What the system may refuse.
+use cli::{AttachArguments, Cli, Command, ReportArguments, RunArguments, Task};
+
+/// Contexts of errors that the operating system may return.
 const RUNTIME: &str = "cannot start the runtime";
 const SIGNALS: &str = "cannot listen for signals";
-/// How long a learner that nobody supervises may still be ending, before its run is resumed.
+/// Time that an unsupervised learner has to end before its run is resumed.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Trains a drone to avoid obstacles from its depth camera.
-#[derive(Parser)]
-#[command(version)]
-struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Subcommand)]
-enum Command {
-    /// Start a learner and its actors, and watch them until the run ends.
-    Run(RunArguments),
-    /// Add actors to a run that is under way on this machine.
-    Attach(AttachArguments),
-    /// Draw the plots of a run again.
-    Report(ReportArguments),
-}
-
-#[derive(Args)]
-struct RunArguments {
-    /// What to train, and how.
-    #[arg(
-        long,
-        value_name = "FILE",
-        overrides_with = "config",
-        required_unless_present = "resume"
-    )]
-    config: Option<PathBuf>,
-    /// Where everything goes; must be new or empty.
-    #[arg(
-        long,
-        value_name = "DIR",
-        overrides_with = "run_dir",
-        required_unless_present = "resume"
-    )]
-    run_dir: Option<PathBuf>,
-    /// Go on with the run in this directory, with the configuration it was started with.
-    #[arg(long, value_name = "DIR")]
-    resume: Option<PathBuf>,
-    /// Actors to start [default: number of cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    actors: Option<u32>,
-    /// Change one setting of the config; may be repeated.
-    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
-    overrides: Vec<String>,
-}
-
-#[derive(Args)]
-struct AttachArguments {
-    /// The run's directory.
-    #[arg(long, value_name = "DIR")]
-    run: PathBuf,
-    /// Actors to start.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    count: u32,
-}
-
-#[derive(Args)]
-struct ReportArguments {
-    /// The run's directory.
-    #[arg(long, value_name = "DIR")]
-    run: PathBuf,
-}
-
-/// A run that failed, and what is left of it.
+/// A run that failed; the user has read why.
 #[derive(Debug, thiserror::Error)]
-#[error("{source}")]
-struct Unfinished {
-    run: RunDirectory,
-    #[source]
-    source: SupervisorError,
-}
+#[error("the run failed")]
+struct Unfinished;
 
 fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
-        Command::Run(arguments) => run(&arguments),
-        Command::Attach(arguments) => attach(&arguments),
+        Command::Run(arguments) => run(&arguments).map(status),
+        Command::Attach(arguments) => attach(&arguments).map(status),
+        Command::Evaluate(arguments) => skein_evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
+        Command::Experiment(arguments) => {
+            warn_of_environment();
+            experiment::carry_out(&arguments)
+        }
         Command::Report(arguments) => report(&arguments),
     };
     match outcome {
-        Ok(Ended::Finished) => ExitCode::SUCCESS,
-        Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
+        Ok(status) => status,
         Err(error) => {
-            eprintln!("skein: {}", with_causes(error.as_ref()));
-            // What keeps a learner from starting would keep it from going on, too.
-            if let Some(Unfinished { run, source }) = error.downcast_ref()
-                && !source.tells_all()
-            {
-                tell_how_to_go_on(run);
+            // What failed in a run has been printed already.
+            if !error.is::<Unfinished>() {
+                note!("skein: {}", with_causes(error.as_ref()));
             }
             ExitCode::FAILURE
         }
     }
 }
 
+fn status(ended: Ended) -> ExitCode {
+    match ended {
+        Ended::Finished => ExitCode::SUCCESS,
+        Ended::Interrupted => ExitCode::from(EXIT_INTERRUPTED),
+    }
+}
+
 fn run(arguments: &RunArguments) -> anyhow::Result<Ended> {
-    // Whatever the processes of a run write is their user's alone.
+    // All files of a run are readable by its user alone.
     umask(Mode::RWXG | Mode::RWXO);
     let programs = Programs::beside_this()?;
     let actors = match arguments.actors {
         Some(actors) => actors as usize,
         None => thread::available_parallelism().map_or(1, Into::into),
     };
+    warn_of_environment();
+    raise_file_limit(actors)?;
     sweep();
-    let (prepared, seat) = match arguments.task() {
+    let (prepared, lock) = match arguments.task() {
         Task::New { config, run_dir } => {
             let prepared = prepare(config, &arguments.overrides, run_dir, actors)?;
-            let seat = SupervisorSeat::take(&prepared.run, &prepared.identity)?;
-            (prepared, seat)
+            let lock = SupervisorLock::take(&prepared.run, &prepared.identity)?;
+            (prepared, lock)
         }
-        Task::Resume(directory) => resume(directory, actors, PATIENCE)?,
+        Task::Resume {
+            directory,
+            episodes,
+        } => resume(directory, episodes, actors, PATIENCE)?,
     };
     announce(&prepared, actors, arguments);
     let Prepared {
-        run,
-        config,
-        courses,
-        new,
-        ..
+        run, config, new, ..
     } = &prepared;
     if let Some(warning) = scarce_disk(config, run.root()) {
-        eprintln!("skein: {warning}");
+        note!("skein: {warning}");
     }
 
     let claims = claim_actors(run, actors)?;
-    let plan = Plan {
+    let plan = SupervisionPlan {
         run: run.clone(),
         programs,
         actors: claims.iter().map(ActorClaim::id).collect(),
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(config),
     };
-    let mut display = Display::new();
+    let mut display = ProgressDisplay::new();
     let outcome = runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
         anyhow::Ok(supervisor::run(&plan, &mut interrupts, &mut display).await)
     });
     display.finish();
-    drop(seat);
+    drop(lock);
     sweep();
 
-    let outcome = outcome?;
-    if let (Some(new), Err(error)) = (new, &outcome)
-        && error.tells_all()
-        && run.newest_checkpoint().is_none()
-    {
-        // The run never began; its directory would only be in the way of the next attempt.
-        if let Err(error) = new.take_back() {
-            eprintln!("skein: {} remains: {error}", run.root().display());
-        }
-        return Ok(outcome?);
-    }
-
-    // Plots are a service: a run that failed may have left something worth looking at, and one that succeeded has, plots or not.
-    let window = config.evaluation.window_flights as usize;
-    if let Err(error) = reports::draw_all(run, courses, window, ideal_walls_passed(config)?) {
-        eprintln!("skein: not all plots could be drawn: {error}");
-    }
-    let ended = outcome.map_err(|source| Unfinished {
-        run: run.clone(),
-        source,
-    })?;
-    print!("{}", conclusion(run));
-    // Whoever told the learner alone to stop has interrupted the run as well, and a run may be complete before it heeds an interruption.
-    let ended = match Summary::of(run).map(|summary| summary.ending) {
-        Some(Ending::Completed) => Ended::Finished,
-        Some(Ending::Interrupted) => Ended::Interrupted,
+    let ended = match outcome? {
+        Ok(ended) => ended,
+        Err(error) => return Err(failed(run, config, new.as_ref(), &error).into()),
+    };
+    draw_if_possible(run, config);
+    show!("{}", conclusion(run, stdout_columns()).trim_end());
+    // A user who stopped only the learner has interrupted the run as well. Conversely, a run may
+    // complete before it acts on an interruption.
+    let ended = match run.summary().map(|summary| summary.ending) {
+        Some(RunEnding::Completed) => Ended::Finished,
+        Some(RunEnding::Interrupted) => Ended::Interrupted,
         None => ended,
     };
     if ended == Ended::Interrupted {
-        if Summary::of(run).is_none() {
+        if run.summary().is_none() {
             let newest = run.newest_checkpoint();
-            let kept = newest.map_or("there is no checkpoint yet".to_owned(), |flights| {
-                format!("the newest checkpoint is of flight {flights}")
+            let kept = newest.map_or("there is no checkpoint yet".to_owned(), |episodes| {
+                format!("the newest checkpoint was written after episode {episodes}")
             });
-            eprintln!("skein: stopped at once: {kept}");
+            note!("skein: stopped immediately: {kept}");
         }
-        tell_how_to_go_on(run);
+        print_resume_command(run);
     }
     Ok(ended)
 }
 
-/// What `skein run` is to do.
-enum Task<'a> {
-    New { config: &'a Path, run_dir: &'a Path },
-    Resume(&'a Path),
+/// Prints why a run failed and what can be done, before anything else can fail.
+fn failed(
+    run: &RunDirectory,
+    config: &Config,
+    new: Option<&NewDirectory>,
+    error: &SupervisorError,
+) -> Unfinished {
+    note!("skein: {}", with_causes(error));
+    if let SupervisorError::DirectoryGone(_) = error {
+        return Unfinished;
+    }
+    // A learner that cannot start cannot be resumed either.
+    if !error.is_self_explanatory() {
+        print_resume_command(run);
+    } else if let Some(new) = new
+        && run.newest_checkpoint().is_none()
+    {
+        // The run never began: its directory would only block the next attempt.
+        if let Err(error) = new.take_back() {
+            note!("skein: {} remains: {error}", run.root().display());
+        }
+        return Unfinished;
+    }
+    draw_if_possible(run, config);
+    Unfinished
 }
 
-impl RunArguments {
-    /// Ends the process with the reason if the arguments contradict each other.
-    fn task(&self) -> Task<'_> {
-        match (&self.resume, &self.config, &self.run_dir) {
-            (None, Some(config), Some(run_dir)) => Task::New { config, run_dir },
-            (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume(directory),
-            _ => Cli::command()
-                .error(
-                    ErrorKind::ArgumentConflict,
-                    "a run is resumed in its own directory, with the configuration it was started with: --config, --run-dir and --set cannot be given with --resume",
-                )
-                .exit(),
-        }
+/// Draws the plots. They are optional: a run that failed may still have left something to draw, and
+/// a run that succeeded is a success without them.
+fn draw_if_possible(run: &RunDirectory, config: &Config) {
+    let Ok(plots) = catch_unwind(AssertUnwindSafe(|| draw(run, config))) else {
+        note!("skein: some plots could not be drawn: the drawing panicked");
+        return;
+    };
+    report_failures(&plots.failures);
+    if !plots.failures.is_empty() {
+        let root = quoted(run.root());
+        note!("skein: everything else is kept; to draw again: skein report --run {root}");
     }
 }
 
-/// Tells what is about to be done.
+/// Reports variables of the environment that the processes of a run cannot use: in their logs
+/// nobody would look for it.
+fn warn_of_environment() {
+    for fault in environment_faults() {
+        note!("skein: {fault}");
+    }
+}
+
+/// Prints what is about to start.
 fn announce(prepared: &Prepared, actors: usize, arguments: &RunArguments) {
     let config = &prepared.config;
-    eprintln!(
-        "skein: {actors} {}, {} training flights, seed {}",
+    note!(
+        "skein: {actors} {}, {} training episodes, seed {}",
         if actors == 1 { "actor" } else { "actors" },
-        config.run.flights,
+        config.run.episodes,
         config.run.seed
     );
     let root = prepared.run.root().display();
     if arguments.resume.is_some() {
-        eprintln!("skein: going on with the run in {root}");
+        note!("skein: resuming the run in {root}");
         return;
     }
-    eprintln!("skein: everything goes to {root}");
+    note!("skein: run directory: {root}");
     if !config.courses.evaluation.contains(&config.courses.training) {
-        eprintln!(
-            "skein: note: the training course is not among courses.evaluation; the best snapshot is chosen on {}",
-            prepared.courses.first().map_or("none", |course| &course.name)
+        let names = CoursesSection::names(&config.courses.evaluation);
+        note!(
+            "skein: note: the training course is not in courses.evaluation; \
+                 the best snapshot is chosen on {}",
+            names.first().map_or("none", String::as_str)
+        );
+    }
+    let confirming = config.evaluation.confirm_episodes;
+    if confirming < EvaluationSection::FEW_EPISODES {
+        note!(
+            "skein: note: evaluation.confirm_episodes = {confirming}: \
+                 so few say little about which snapshot is the best; {} or more do",
+            EvaluationSection::FEW_EPISODES
         );
     }
 }
 
-/// The last line about a run that is not complete.
-fn tell_how_to_go_on(run: &RunDirectory) {
-    let root = run.root().display().to_string();
-    let is_plain = |character: char| character.is_alphanumeric() || "/._-+=:,@".contains(character);
-    let root = match root.chars().all(is_plain) {
-        true => root,
-        false => format!("'{}'", root.replace('\'', r"'\''")),
-    };
-    eprintln!("skein: to go on with it: launch/run_local.sh --resume {root}");
+/// Prints the command that resumes an incomplete run.
+fn print_resume_command(run: &RunDirectory) {
+    let root = quoted(run.root());
+    note!("skein: to resume this run: launch/run_local.sh --resume {root}");
 }
 
 fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
+    warn_of_environment();
+    raise_file_limit(arguments.count as usize)?;
     let programs = Programs::beside_this()?;
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    // Between two lives of its learner, a run is under way as long as somebody sees to it that there will be another.
-    if !run.is_under_way()? {
-        let root = run.root().display();
+    // While the learner restarts, its supervisor keeps the run under way.
+    if !run.is_running()? {
         bail!(
-            "the run in {root} is not under way on this machine; one that is not complete is gone on with by launch/run_local.sh --resume {root}"
+            "the run in {} is not under way on this machine; \
+              if it is incomplete, resume it with launch/run_local.sh --resume {}",
+            run.root().display(),
+            quoted(run.root())
         );
     }
     umask(Mode::RWXG | Mode::RWXO);
@@ -283,55 +257,97 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
     let claims = claim_actors(&run, arguments.count as usize)?;
     let actors: Vec<_> = claims.iter().map(ActorClaim::id).collect();
     let most = config.transport.max_actors;
-    // The lowest free numbers were claimed: with those from the limit on, there would be too many.
+    // The lowest free ids were claimed. Ids at or above the limit exceed the allowed number.
     let too_many = actors.iter().filter(|id| id.0 as usize >= most).count();
     if too_many > 0 {
-        bail!("that is {too_many} more than transport.max_actors = {most} of this run allows: attach fewer");
+        bail!("this run allows transport.max_actors = {most} actors: attach {too_many} fewer");
     }
     let names: Vec<_> = actors.iter().map(ToString::to_string).collect();
-    eprintln!(
-        "skein: adding actor {} to {}; Ctrl-C takes them away again",
+    note!(
+        "skein: adding actor {} to {}; Ctrl-C removes them again",
         names.join(", "),
         run.root().display()
     );
-    let plan = Plan {
+    let plan = SupervisionPlan {
         run: run.clone(),
         programs,
         actors,
         learner_threads: config.run.learner_threads,
         deadlines: Deadlines::of(&config),
     };
-    let mut display = Display::new();
+    let mut display = ProgressDisplay::new();
     runtime().context(RUNTIME)?.block_on(async {
         let mut interrupts = interrupts().context(SIGNALS)?;
-        let is_under_way = || run.is_under_way().unwrap_or(false);
+        let is_under_way = || run.is_running().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
     })
 }
 
-fn report(arguments: &ReportArguments) -> anyhow::Result<Ended> {
+fn report(arguments: &ReportArguments) -> anyhow::Result<ExitCode> {
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
-    let courses = load_courses(&config)?;
-    let window = config.evaluation.window_flights as usize;
-    for picture in reports::draw_all(&run, &courses, window, ideal_walls_passed(&config)?)? {
-        println!("{}", picture.display());
+    let plots = draw(&run, &config);
+    for picture in &plots.pictures {
+        show!("{}", picture.display());
     }
-    Ok(Ended::Finished)
+    report_failures(&plots.failures);
+    if !plots.failures.is_empty() {
+        return Ok(ExitCode::FAILURE);
+    }
+    if plots.pictures.is_empty() {
+        note!(
+            "skein: {} holds nothing to draw yet: no episode has ended",
+            run.root().display()
+        );
+    }
+    Ok(ExitCode::SUCCESS)
 }
 
-/// Removes what runs of this user left whose processes were all killed.
+/// Plots of a run, and a message for each that could not be drawn.
+struct Plots {
+    pictures: Vec<PathBuf>,
+    failures: Vec<String>,
+}
+
+/// Draws every plot that the run left the files for. A course that cannot be read costs only what
+/// needs it.
+fn draw(run: &RunDirectory, config: &Config) -> Plots {
+    let mut failures = Vec::new();
+    let courses = load_courses(config).unwrap_or_else(|error| {
+        failures.push(with_causes(&error));
+        Vec::new()
+    });
+    let ideal = ideal_walls_passed(config)
+        .map_err(|error| failures.push(with_causes(&error)))
+        .ok();
+    failures.dedup();
+    let window = config.evaluation.window_episodes as usize;
+    let drawn = skein_reports::draw_all(run, &courses, window, ideal);
+    failures.extend(drawn.failures.iter().map(|error| with_causes(error)));
+    Plots {
+        pictures: drawn.pictures,
+        failures,
+    }
+}
+
+fn report_failures(failures: &[String]) {
+    for failure in failures {
+        note!("skein: a plot could not be drawn: {failure}");
+    }
+}
+
+/// Removes the remains of this user's runs whose processes were all killed.
 fn sweep() {
     for failure in sweep_leftovers().failures {
-        eprintln!("skein: not removed: {failure}");
+        note!("skein: could not remove: {failure}");
     }
 }
 
-/// The run in `directory`, by its absolute path: processes of a run compare paths.
+/// Returns the run in `directory`, by its absolute path, because processes of a run compare paths.
 fn open(directory: &Path) -> anyhow::Result<RunDirectory> {
     let root = directory
         .canonicalize()
-        .with_context(|| format!("{} is no directory of a run", directory.display()))?;
+        .with_context(|| format!("{} is not a run directory", directory.display()))?;
     Ok(RunDirectory::new(root))
 }
 

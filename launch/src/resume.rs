@@ -1,93 +1,114 @@
-//! What must hold for a run to be gone on with, and who may do it.
+//! Checks that a run can be resumed, and claims it.
 
 use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_protocol::run::{PlaceError, RunDirectory, RunError, SeatError, SupervisorSeat};
-use skein_protocol::summary::{Ending, Summary};
+use skein_run::terminal::quoted;
+use skein_run::{LockError, PathError, RunDirectory, RunError, SupervisorLock};
 
-use crate::prepare::room::{check_folders, check_shared_memory};
-use crate::prepare::{PrepareError, Prepared, check, load_courses};
+use skein_prepare::room::{check_folders, check_shared_memory};
+use skein_prepare::{PrepareError, Prepared, check};
 
-/// Between two looks whether an earlier learner is gone.
+/// Time between two checks whether an earlier learner has ended.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// Why a run cannot be gone on with.
+/// Reason why a run cannot be resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum ResumeError {
-    /// There is no run in the directory.
+    /// The directory holds no run.
     #[error(
-        "{} is not the directory of a run, it holds no {}: give the one that the run's first lines named",
+        "{} is not a run directory: it holds no {}. \
+             Give the directory that the run printed when it started",
         directory.display(),
         missing.display()
     )]
     NotARun {
         /// The directory.
         directory: PathBuf,
-        /// What it should hold.
+        /// The file it should hold.
         missing: PathBuf,
     },
-    /// All of it is done.
+    /// All its training episodes are done.
     #[error(
-        "the run in {} is complete, all {flights} flights of it: there is nothing to go on with; start a new one for more. target/release/skein report --run {} draws its plots again, launch/evaluate.sh --run {} flies its best snapshot again",
+        "the run in {} is complete (all {episodes} episodes), so it cannot be resumed; \
+             launch/run_local.sh --resume {} --episodes N lengthens it to N episodes in all, \
+             target/release/skein report --run {} draws its plots again, \
+             launch/evaluate.sh --run {} flies its best snapshot again",
         directory.display(),
-        directory.display(),
-        directory.display()
+        quoted(directory),
+        quoted(directory),
+        quoted(directory)
     )]
     Complete {
-        /// Its directory.
+        /// The run directory.
         directory: PathBuf,
-        /// Its training flights.
-        flights: u64,
+        /// Number of its training episodes.
+        episodes: u64,
     },
-    /// Somebody is at it.
+    /// Another supervisor or learner runs it.
     #[error(
-        "the run in {} is under way: give it more actors with launch/attach_actor.sh --run {}, or stop it first",
+        "the run in {} is under way: add actors with launch/attach_actor.sh --run {}, \
+             or stop it first",
         .0.display(),
-        .0.display()
+        quoted(.0)
     )]
     UnderWay(PathBuf),
-    /// It is of another version, was changed, or cannot be started on this machine.
+    /// Another version made the run, it was changed, or this machine cannot start it.
     #[error(transparent)]
     Prepare(#[from] PrepareError),
-    /// Its files cannot be used.
+    /// Its files cannot be read or written.
     #[error(transparent)]
     Run(#[from] RunError),
-    /// Its transport cannot be looked at: it is another user's.
+    /// Its transport belongs to another user.
     #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// It is under way in another directory, of which this one is a copy.
-    #[error("the run in {} is under way in another directory, of which this one is a copy: {source}", directory.display())]
+    Path(#[from] PathError),
+    /// The run is under way in another directory, of which this one is a copy.
+    #[error("the run in {} is under way in another directory, of which this one is a copy: \
+             {source}", directory.display())]
     Copy {
         /// The directory.
         directory: PathBuf,
-        /// Who is at it.
+        /// Process that holds the run's lock.
         #[source]
-        source: SeatError,
+        source: LockError,
     },
 }
 
-/// Checks that the run in `directory` can be gone on with by `actors` actors, and claims it. A learner that nobody supervises is given `patience`
-/// to end.
+/// Checks that `actors` actors can resume the run in `directory`, and claims it. An unsupervised
+/// learner that is still running gets `patience` to end. `episodes` lengthens the run to so many
+/// training episodes.
 ///
 /// # Errors
-/// [`ResumeError`]; nothing was changed then.
-pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Prepared, SupervisorSeat), ResumeError> {
+/// Returns [`ResumeError`]; in this case nothing was changed.
+pub fn resume(
+    directory: &Path,
+    episodes: Option<u64>,
+    actors: usize,
+    patience: Duration,
+) -> Result<(Prepared, SupervisorLock), ResumeError> {
     let not_a_run = |missing: &Path| ResumeError::NotARun {
         directory: directory.to_owned(),
         missing: missing.to_owned(),
     };
-    let run = RunDirectory::new(directory.canonicalize().map_err(|_| not_a_run(Path::new("run.json")))?);
+    let run = RunDirectory::new(
+        directory
+            .canonicalize()
+            .map_err(|_| not_a_run(Path::new("run.json")))?,
+    );
     if !run.identity().is_file() {
         return Err(not_a_run(Path::new("run.json")));
     }
-    let (identity, config) = run.open()?;
+    let (identity, config) = match episodes {
+        // A lengthening that was cut off is repeated below.
+        Some(_) => run.open_to_lengthen()?,
+        None => run.open()?,
+    };
     let under_way = || ResumeError::UnderWay(run.root().to_owned());
-    // Whoever only looks whether it is taken holds it for a moment.
-    let seat = in_time(LOOK * 5, || match SupervisorSeat::take(&run, &identity) {
-        Err(SeatError::Taken { lock, .. }) if lock == run.root() => Ok(None),
-        Err(SeatError::Place(error)) => Err(error.into()),
+    // A process that only checks whether the lock is taken holds it for a moment.
+    let lock = in_time(LOOK * 5, || match SupervisorLock::take(&run, &identity) {
+        Err(LockError::Taken { lock, .. }) if lock == run.root() => Ok(None),
+        Err(LockError::Path(error)) => Err(error.into()),
         taken => taken.map(Some).map_err(|source| ResumeError::Copy {
             directory: run.root().to_owned(),
             source,
@@ -95,36 +116,41 @@ pub fn resume(directory: &Path, actors: usize, patience: Duration) -> Result<(Pr
     })?
     .ok_or_else(under_way)?;
     in_time(patience, || {
-        Ok::<_, PlaceError>((!identity.is_learner_alive()?).then_some(()))
+        Ok::<_, PathError>((!identity.is_learner_alive()?).then_some(()))
     })?
     .ok_or_else(under_way)?;
-    if let Some(summary) = Summary::of(&run)
-        && summary.ending == Ending::Completed
+    let (identity, config) = match episodes {
+        Some(episodes) => run.lengthen(episodes)?,
+        None => (identity, config),
+    };
+    if let Some(summary) = run.summary()
+        && summary.is_of_whole(&config)
     {
         return Err(ResumeError::Complete {
             directory: run.root().to_owned(),
-            flights: summary.flights,
+            episodes: summary.episodes,
         });
     }
     run.make_folders()?;
     check(&run.config(), &config, actors)?;
     check_shared_memory(&config, actors).map_err(PrepareError::from)?;
     check_folders().map_err(PrepareError::from)?;
-    let courses = load_courses(&config).map_err(PrepareError::from)?;
     Ok((
         Prepared {
             run,
             identity,
             config,
-            courses,
             new: None,
         },
-        seat,
+        lock,
     ))
 }
 
-/// Looks again and again for what `look` may find, for so long.
-fn in_time<T, E>(patience: Duration, look: impl Fn() -> Result<Option<T>, E>) -> Result<Option<T>, E> {
+/// Calls `look` repeatedly until it finds something or `patience` is over.
+fn in_time<T, E>(
+    patience: Duration,
+    look: impl Fn() -> Result<Option<T>, E>,
+) -> Result<Option<T>, E> {
     let deadline = Instant::now() + patience;
     loop {
         match look()? {
@@ -141,32 +167,40 @@ mod tests {
     use skein_protocol::config::Config;
 
     use super::*;
-    use crate::prepare::tests::prepared_run;
+    use skein_prepare::prepare;
+
+    /// A run of the shipped small configuration in a folder of `directory`, ready to be started.
+    fn prepared_run(directory: &Path) -> Prepared {
+        let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/smoke.toml");
+        prepare(&config, &[], &directory.join("run"), 1).unwrap()
+    }
 
     fn refusal(directory: &Path) -> String {
-        resume(directory, 1, Duration::ZERO).unwrap_err().to_string()
+        resume(directory, None, 1, Duration::ZERO)
+            .unwrap_err()
+            .to_string()
     }
 
     #[test]
-    fn an_unfinished_run_can_be_gone_on_with_by_one_supervisor() {
+    fn an_unfinished_run_can_be_resumed_by_one_supervisor() {
         let directory = tempfile::tempdir().unwrap();
         let prepared = prepared_run(directory.path());
-        let (resumed, seat) = resume(prepared.run.root(), 3, Duration::ZERO).unwrap();
+        let (resumed, lock) = resume(prepared.run.root(), None, 3, Duration::ZERO).unwrap();
         assert_eq!(
-            (&resumed.identity, &resumed.config, &resumed.courses),
-            (&prepared.identity, &prepared.config, &prepared.courses)
+            (&resumed.identity, &resumed.config),
+            (&prepared.identity, &prepared.config)
         );
         assert!(refusal(prepared.run.root()).contains("is under way"));
-        drop(seat);
-        assert!(resume(prepared.run.root(), 1, Duration::ZERO).is_ok());
+        drop(lock);
+        assert!(resume(prepared.run.root(), None, 1, Duration::ZERO).is_ok());
     }
 
     #[test]
-    fn what_is_no_run_is_refused_with_what_to_give_instead() {
+    fn a_directory_without_a_run_is_refused_with_a_remedy() {
         let directory = tempfile::tempdir().unwrap();
-        for path in [directory.path(), Path::new("/nowhere")] {
+        for path in [directory.path(), directory.path().join("missing").as_path()] {
             let error = refusal(path);
-            assert!(error.contains("not the directory of a run"), "{error}");
+            assert!(error.contains("is not a run directory"), "{error}");
         }
     }
 
@@ -175,12 +209,14 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = prepared_run(directory.path()).run;
         let actors = Config::default().transport.max_actors + 1;
-        let error = resume(run.root(), actors, Duration::ZERO).unwrap_err().to_string();
+        let error = resume(run.root(), None, actors, Duration::ZERO)
+            .unwrap_err()
+            .to_string();
         assert!(error.contains("max_actors"), "{error}");
         let text = fs::read_to_string(run.config())
             .unwrap()
             .replace("seed = 1", "seed = 2");
         fs::write(run.config(), text).unwrap();
-        assert!(refusal(run.root()).contains("was changed"));
+        assert!(refusal(run.root()).contains("has changed since the run was started"));
     }
 }

@@ -1,22 +1,24 @@
-//! Drawing a minibatch from a full split replay buffer, from small buffers to large ones.
+//! Sampling a minibatch from a full split replay buffer, from small buffers to large ones.
 //!
-//! The configured size is 2^17; the others show what a batch costs once its rows no longer lie in a cache.
+//! The configured size is 2^17; the others show the cost of a batch whose rows no longer fit into a
+//! cache.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use rand::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_learner::flight::{CommittedFlight, StepObservation};
+use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, LONGEST_LATENT};
+use skein_protocol::{ACTION, GROUND_TRUTH, MAX_LATENT, REWARD_TERMS};
 
-/// Transitions a minibatch.
+/// Transitions per minibatch.
 const BATCH: usize = 256;
-/// Steps of each flight that fills the buffer.
+/// Steps of each episode that fills the buffer.
 const STEPS: usize = 64;
-/// Every so many steps pass a wall: more than the success part's share, so that it fills no later than the other.
+/// Steps per passed wall: more walls than the success share, so that the success part fills no
+/// later than the other.
 const STEPS_PER_WALL: usize = 4;
 
 fn main() {
@@ -26,7 +28,7 @@ fn main() {
     for exponent in [17, 10, 12, 14, 16, 18, 20] {
         let mut replay = None;
         group.bench_function(BenchmarkId::new("sample", 1_usize << exponent), |bencher| {
-            // Only when it is asked for: the large ones take a while to fill.
+            // Created on demand: large buffers take a while to fill.
             let replay = replay.get_or_insert_with(|| full(1 << exponent));
             let mut rng = Pcg64Mcg::seed_from_u64(1);
             let mut minibatch = Minibatch::default();
@@ -37,7 +39,7 @@ fn main() {
     criterion.final_summary();
 }
 
-/// A buffer for `capacity` transitions, both parts full.
+/// Returns a buffer for `capacity` transitions, both parts full.
 fn full(capacity: usize) -> Replay {
     let mut config = Config::default();
     config.replay.capacity = capacity;
@@ -45,21 +47,21 @@ fn full(capacity: usize) -> Replay {
     let mut replay = Replay::new(&config);
     replay.freeze();
     let mut rng = Pcg64Mcg::seed_from_u64(2);
-    for flight in 0.. {
+    for episode in 0.. {
         if replay.len() == capacity {
             break;
         }
         replay
-            .insert(flown(flight, &mut rng))
-            .expect("the flight's parts have one length");
+            .insert(flown(episode, &mut rng))
+            .expect("the episode's parts have one length");
     }
     replay
 }
 
-fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
+fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
     let mut draw = || (rng.next_u32() as f32 / u32::MAX as f32) * 2.0 - 1.0;
-    CommittedFlight {
-        flight: FlightId(number),
+    CommittedEpisode {
+        episode: EpisodeId(number),
         epoch: Epoch(number),
         policy_version: PolicyVersion(0),
         actor: ActorId(0),
@@ -68,7 +70,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
         action_before: [0.0; ACTION],
         observations: (0..=STEPS)
             .map(|_| StepObservation {
-                latent: [(); LONGEST_LATENT].map(|()| draw()),
+                latent: [(); MAX_LATENT].map(|()| draw()),
                 velocity_mps: [(); 3].map(|()| draw()),
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],
@@ -77,7 +79,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedFlight {
             .collect(),
         actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
         rewards: (0..STEPS).map(|_| draw()).collect(),
-        reward_terms: vec![[0.0; 4]; STEPS],
+        reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),
         outcome: Some(Outcome::Collided),
         walls_passed: 0,

@@ -1,4 +1,5 @@
-//! A SAC update, batch 256, on one thread: on our kernels, as its networks grow wider, and on libtorch with automatic gradients.
+//! A SAC update, batch 256, on one thread: native with networks of growing width, and on libtorch
+//! with automatic gradients.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use skein_kernels::{Isa, Team};
@@ -10,9 +11,9 @@ use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-/// Numbers in an observation, as in `local.toml`.
+/// Width of an observation, as in `local.toml`.
 const OBSERVATION: usize = 34;
-/// The default.
+/// Default width of hidden layers.
 const WIDTH: usize = 256;
 
 fn main() {
@@ -20,8 +21,10 @@ fn main() {
     use_threads(1);
     let rows = SacSection::default().batch_size;
     let mut noise = Noise::new(1);
-    let mut draw = |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
-    let [observations, actions, rewards, next_observations] = [OBSERVATION, ACTION, 1, OBSERVATION].map(&mut draw);
+    let mut draw =
+        |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
+    let [observations, actions, rewards, next_observations] =
+        [OBSERVATION, ACTION, 1, OBSERVATION].map(&mut draw);
     let columns = Columns {
         observations: &observations,
         actions: &actions,
@@ -51,7 +54,10 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
     };
     let (mut team, mut noise) = (Team::new(1), Noise::new(2));
     let mut group = criterion.benchmark_group("sac_update");
-    group.throughput(Throughput::Elements(operations(columns.rewards.len(), width)));
+    group.throughput(Throughput::Elements(operations(
+        columns.rewards.len(),
+        width,
+    )));
     group.bench_function(BenchmarkId::new(engine.to_string(), width), |bencher| {
         bencher.iter(|| {
             sac.update(&mut team, columns, &mut noise)
@@ -61,16 +67,18 @@ fn update(criterion: &mut Criterion, engine: Engine, width: usize, columns: Colu
     group.finish();
 }
 
-/// Floating-point operations that the products of one update cannot do without, a multiplication and an addition counted as two; nothing else is counted.
+/// Floating-point operations of an update's necessary matrix products; a multiplication and an
+/// addition count as two. Nothing else is counted.
 fn operations(rows: usize, width: usize) -> u64 {
     let (observation, estimates) = (OBSERVATION, 2);
-    // Weights: the layers of the policy, and those of the critic.
+    // Number of weights: the policy's layers, and the critic's.
     let policy_first = observation * width;
     let policy_rest = 2 * width * width + width * 2 * ACTION;
     let critic_first = (observation + ACTION) * width;
     let critic_rest = width * width + width * estimates;
     let forward = 2 * (policy_first + policy_rest) + 3 * (critic_first + critic_rest);
-    // Gradients of all weights; what flows back through all layers but the first ones, and through the critic once more, to the action only.
+    // Weight gradients of all layers; gradients through all layers but the first ones; and once
+    // more through the critic, to the action only.
     let gradients = policy_first + policy_rest + critic_first + critic_rest;
     let back = policy_rest + 2 * critic_rest + width * ACTION;
     (2 * rows * (forward + gradients + back)) as u64

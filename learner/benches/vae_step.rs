@@ -1,4 +1,4 @@
-//! A VAE step, batch 16, on one thread: on our kernels, and on libtorch with automatic gradients.
+//! A VAE step, batch 16, on one thread: native, and on libtorch with automatic gradients.
 
 use criterion::{Criterion, Throughput};
 use skein_learner::device::use_threads;
@@ -8,7 +8,7 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::VaeSection;
 use tch::Device;
 
-/// As in `local.toml`.
+/// Images per batch, as in `local.toml`.
 const BATCH: usize = 16;
 
 fn main() {
@@ -26,7 +26,11 @@ fn main() {
     let mut group = criterion.benchmark_group("vae_step");
     group.throughput(Throughput::Elements(of_an_image as u64 * BATCH as u64));
     group.bench_function("native", |bencher| {
-        bencher.iter(|| native.update(&images, &mut noise).expect("images are finite"));
+        bencher.iter(|| {
+            native
+                .update(&images, &mut noise)
+                .expect("images are finite")
+        });
     });
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {

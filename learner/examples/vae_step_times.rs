@@ -1,4 +1,5 @@
-//! Prints how long a VAE step takes on this machine, on both engines, where in the network the time goes, and how near that is to what its cores can do.
+//! Prints the time of a VAE step on this machine, on both engines, by layer, and relative to the
+//! peak of its cores.
 //!
 //! `cargo run --release -p skein-learner --example vae_step_times -- [THREADS]`
 
@@ -19,7 +20,10 @@ fn main() {
     use_threads(threads);
     let isa = Isa::best();
     let peak = peak_flops(isa) * threads as f64;
-    println!("{isa}, peak of {threads} threads: {:.1} GFLOP/s", peak / 1e9);
+    println!(
+        "{isa}, peak of {threads} threads: {:.1} GFLOP/s",
+        peak / 1e9
+    );
     for batch in [32, 16] {
         vae(batch, threads, peak);
     }
@@ -36,14 +40,16 @@ fn vae(batch: usize, threads: usize, peak: f64) {
         NativeVae::new(&section, 1, threads),
         TorchVae::new(&section, 1, Device::Cpu),
     );
-    let mut spent = None;
+    let mut times = None;
     let mut vae_noise = Noise::new(3);
     let native_millis = report("VAE step, native", batch, STEPS, || {
-        if spent.is_none() {
-            let _ = native.take_spent();
+        if times.is_none() {
+            let _ = native.take_times();
         }
-        native.update(&bytes, &mut vae_noise).expect("images are finite");
-        spent = Some(native.take_spent());
+        native
+            .update(&bytes, &mut vae_noise)
+            .expect("images are finite");
+        times = Some(native.take_times());
     });
     let torch_millis = report("VAE step, libtorch", batch, STEPS / 2, || {
         torch
@@ -61,10 +67,10 @@ fn vae(batch: usize, threads: usize, peak: f64) {
         share_of_peak(torch_millis),
         torch_millis / native_millis
     );
-    let spent = spent.expect("steps were done");
+    let times = times.expect("steps were done");
     let scale = 1.0 / threads as f64;
     println!("  of the last step, ms by layer (% of peak): forward, backward, gradient");
-    for ((name, secs), operations) in LAYERS.iter().zip(spent.layers).zip(operations) {
+    for ((name, secs), operations) in LAYERS.iter().zip(times.layers).zip(operations) {
         let cells = secs.iter().zip(operations).map(|(secs, operations)| {
             let share = 100.0 * operations * batch as f64 / (secs * peak * scale);
             format!("{:8.2} ({share:4.1})", secs * 1e3 * scale)
@@ -73,9 +79,9 @@ fn vae(batch: usize, threads: usize, peak: f64) {
     }
     println!(
         "    Adam and packing {:.2}, rest {:.2}, total {:.2}",
-        spent.adam_and_packing * 1e3 * scale,
-        spent.rest * 1e3 * scale,
-        spent.total() * 1e3 * scale
+        times.adam_and_packing * 1e3 * scale,
+        times.rest * 1e3 * scale,
+        times.total() * 1e3 * scale
     );
     report("VAE encode, native", batch, 20, || {
         let _ = native.encode(&bytes);
@@ -86,7 +92,8 @@ fn vae(batch: usize, threads: usize, peak: f64) {
     });
 }
 
-/// Runs `work` a few times to warm up, then `repetitions` times; prints and returns the median, which a busy machine disturbs least.
+/// Runs `work` a few times to warm up, then `repetitions` times. Prints and returns the median,
+/// which a busy machine disturbs least.
 fn report(what: &str, batch: usize, repetitions: usize, mut work: impl FnMut()) -> f64 {
     let warm_up = repetitions / 5 + 1;
     let mut millis: Vec<f64> = (0..repetitions + warm_up)

@@ -1,35 +1,36 @@
-//! What a learning algorithm is to the rest of the learner, and which there are.
+//! The interface between a learning algorithm and the rest of the learner.
 //!
-//! It gets minibatches and noise, and gives a policy; replay, transport and actors know nothing of it. Another one is a module beside [`crate::sac`] and [`crate::td3`] that
-//! implements [`Algorithm`], a section of settings that `skein_protocol::config` reads and checks, and a name in `AlgorithmName`, after which the compiler says where else it is asked for.
+//! An algorithm receives minibatches and noise, and yields a policy. Replay, transport and actors
+//! know nothing of it. To add one: write a module beside [`crate::sac`] and [`crate::td3`] that
+//! implements [`Algorithm`], add its settings section to `skein_protocol::config` and its name to
+//! `AlgorithmName`. The compiler then points at every other place that must know it.
 
 use std::fmt;
 
-use skein_kernels::{Isa, Team};
-use skein_protocol::config::{AlgorithmName, Config, CriticInput, Engine};
-use skein_protocol::{ACTION, IMAGE_PIXELS, TRUE_STATE};
-use tch::Device;
+use skein_kernels::Team;
+use skein_protocol::config::{Config, CriticInput};
+use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
 
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::networks::Layout;
 use crate::noise::Noise;
-use crate::sac::{NativeSac, TorchSac};
 use crate::state::Stateful;
-use crate::td3::{NativeTd3, TorchTd3};
 
-/// A way to learn a policy from transitions.
+/// A method that learns a policy from transitions.
 ///
-/// Its state is what [`Stateful::parts`] names: networks begin as functions of the run's seed, and all noise comes from the caller, so that an algorithm restored from its state
-/// goes on bit for bit.
+/// [`Stateful::parts`] names its whole state. Networks start as functions of the run's seed and all
+/// noise comes from the caller, so an algorithm restored from its state continues bit for bit.
 pub trait Algorithm: Stateful + fmt::Debug {
-    /// One update from a minibatch, on the threads of `team`. What it returns are points of curves, the same ones each time.
+    /// Makes one update from a minibatch, on the threads of `team`. Returns the values to plot,
+    /// under the same names each time.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the update's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names the value that was not finite and the update's number;
+    /// nothing has changed then.
     ///
     /// # Panics
-    /// When the columns have different numbers of rows, or none.
+    /// When the columns differ in their number of rows, or have none.
     fn update(
         &mut self,
         team: &mut Team,
@@ -37,10 +38,10 @@ pub trait Algorithm: Stateful + fmt::Debug {
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError>;
 
-    /// Updates done so far.
+    /// Number of updates done so far.
     fn updates(&self) -> u64;
 
-    /// Names and shapes of what [`Algorithm::publish`] copies.
+    /// Names and shapes of the parameters that [`Algorithm::publish`] copies.
     fn policy_layout(&self) -> &Layout;
 
     /// Copies the policy's part of a snapshot, in the snapshot layout's order.
@@ -49,52 +50,43 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// When `into` is not as long as the layout.
     fn publish(&self, into: &mut [f32]);
 
-    /// Copies the encoder's part of a snapshot, in the snapshot layout's order, if this trains an encoder ([`Inputs::from_image`]). What learns from the VAE's codes leaves `into` alone.
+    /// Copies the encoder's part of a snapshot, in the snapshot layout's order. An algorithm that
+    /// trains no encoder ([`Inputs::from_image`] is `None`) leaves `into` alone.
     ///
     /// # Panics
     /// When `into` is not as long as the encoder.
     fn publish_encoder(&self, into: &mut [f32]);
 }
 
-/// The algorithm that a configuration names, untrained. `device`: libtorch's; the native engine is on the processor.
-pub fn new(config: &Config, device: Device) -> Box<dyn Algorithm> {
-    let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
-    match (config.learning.algorithm, engine) {
-        (AlgorithmName::Sac, Engine::Native) => Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best())),
-        (AlgorithmName::Sac, Engine::Libtorch) => Box::new(TorchSac::new(&config.sac, inputs, seed, device)),
-        (AlgorithmName::Td3, Engine::Native) => Box::new(NativeTd3::new(&config.td3, inputs, seed, Isa::best())),
-        (AlgorithmName::Td3, Engine::Libtorch) => Box::new(TorchTd3::new(&config.td3, inputs, seed, device)),
-    }
-}
-
-/// How many numbers the networks see of a state, and where they come from.
+/// Input widths of policy and critic, and where the inputs come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Inputs {
-    /// The policy: an observation.
+    /// Width of the policy's input, the observation.
     pub policy: usize,
-    /// The critic, beside the action.
+    /// Width of the critic's input, the action not counted.
     pub critic: usize,
-    /// How many of them, the first ones, are made of the images in each update, by an encoder that is trained end to end; `None` where the code is the VAE's.
+    /// Number of leading inputs that an encoder trained end to end computes from the images in each
+    /// update; `None` where the latent code is the VAE's.
     pub from_image: Option<usize>,
 }
 
 impl Inputs {
-    /// Those of the run configured by `config`.
+    /// Returns the inputs of the run that `config` describes.
     pub fn of(config: &Config) -> Self {
         let same = Self {
             from_image: config.learning.end_to_end().then_some(config.vae.latent),
-            ..Self::same(config.view().len())
+            ..Self::same(config.observation_layout().len())
         };
         match config.learning.critic_input {
             CriticInput::Observation => same,
             CriticInput::GroundTruth => Self {
-                critic: TRUE_STATE,
+                critic: PRIVILEGED_STATE,
                 ..same
             },
         }
     }
 
-    /// Both see an observation of so many numbers, the VAE's code among them.
+    /// Policy and critic both see an observation of this width, the VAE's latent code included.
     pub fn same(observation: usize) -> Self {
         Self {
             policy: observation,
@@ -104,32 +96,36 @@ impl Inputs {
     }
 }
 
-/// A minibatch as the replay gathers it: one f32 slice for each column, rows back to back.
+/// A minibatch as the replay gathers it: one f32 slice per column, rows back to back.
 #[derive(Debug, Clone, Copy)]
 pub struct Columns<'a> {
-    /// `[n, observation]`.
+    /// Observations before the action, `[rows, observation]`.
     pub observations: &'a [f32],
-    /// `[n, 2]`.
+    /// Actions, `[rows, 2]`.
     pub actions: &'a [f32],
-    /// `[n]`.
+    /// Rewards, `[rows]`.
     pub rewards: &'a [f32],
-    /// `[n, observation]`: what was seen after the action, also where the flight ended there.
+    /// Observations after the action, also where the episode ended there, `[rows, observation]`.
     pub next_observations: &'a [f32],
-    /// What the critic sees, `[n, critic's input]`: the observations again, unless it is told more.
+    /// Critic inputs before the action, `[rows, critic input]`: the observations, or the ground
+    /// truth.
     pub states: &'a [f32],
-    /// The same after the action.
+    /// Critic inputs after the action, `[rows, critic input]`.
     pub next_states: &'a [f32],
-    /// `[n]`: 1 where the state after the action ends the task (a crash, the end wall), 0 elsewhere. A flight cut off by its step limit is not terminated.
+    /// 1 where the state after the action ends the task (a crash, the end wall), else 0, `[rows]`.
+    /// An episode cut off by its step limit is truncated, not terminated.
     pub terminated: &'a [f32],
-    /// Depth images of the observations and of the next ones, `[n, 72, 128]` each; where the encoder is trained end to end, whose codes no row of the replay can hold.
+    /// Depth images before and after the action, `[rows, 72, 128]` each. Present only where the
+    /// encoder is trained end to end: its codes change with every update, so the replay cannot
+    /// store them.
     pub images: Option<[&'a [u8]; 2]>,
 }
 
 impl Columns<'_> {
-    /// Looks whether the columns belong together; returns the number of their rows.
+    /// Checks that the columns fit together; returns their number of rows.
     ///
     /// # Panics
-    /// When they have different numbers of rows, or none.
+    /// When the columns differ in their number of rows, or have none.
     pub(crate) fn check(&self, inputs: Inputs) -> usize {
         let rows = self.rewards.len();
         assert!(rows > 0, "a minibatch has at least one transition");
@@ -152,7 +148,7 @@ impl Columns<'_> {
         let expected = inputs.from_image.map(|_| [rows * IMAGE_PIXELS; 2]);
         assert_eq!(
             images, expected,
-            "two images for each transition, where they are learned from"
+            "two images for each transition, exactly where the encoder is trained end to end"
         );
         rows
     }

@@ -1,26 +1,28 @@
-//! The average of the policy over its latest updates, which flies in its place (Polyak averaging, as of a target network).
+//! Polyak average of the policy over its latest updates, which flies in the policy's place.
 //!
-//! Every update follows its own minibatch, so the policy goes on being tossed about when it no longer improves, and one snapshot flies worse than the next by chance. The
-//! average of many is steadier than any of them.
+//! Every update follows its own minibatch, so the policy keeps fluctuating after it stops
+//! improving, and snapshots differ in quality by chance. The average of many policies is steadier
+//! than any one of them.
 
 use crate::algorithm::Algorithm;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-/// Updates at the beginning of which the average hardly looks back, because an untrained policy is worth forgetting.
+/// Number of first updates over which the average forgets faster, because an untrained policy is
+/// not worth remembering.
 const BEGINNING: f32 = 10.0;
 
 /// A moving average of a policy's parameters.
 #[derive(Debug)]
-pub struct Average {
-    /// The weight of the latest policy.
+pub(crate) struct PolicyAverage {
+    /// Weight of the latest policy.
     weight: f32,
     values: Vec<f32>,
     latest: Vec<f32>,
 }
 
-impl Average {
-    /// The average over some `updates`, exponentially weighted, of the policy of `algorithm`, which it begins as.
-    pub fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
+impl PolicyAverage {
+    /// Starts as the policy of `algorithm`; averages exponentially over about `updates` updates.
+    pub(crate) fn new(updates: usize, algorithm: &dyn Algorithm) -> Self {
         let mut values = vec![0.0; algorithm.policy_layout().len()];
         algorithm.publish(&mut values);
         Self {
@@ -30,10 +32,12 @@ impl Average {
         }
     }
 
-    /// Takes in the policy as an update has left it.
-    pub fn take_in(&mut self, algorithm: &dyn Algorithm) {
+    /// Takes in the policy as an update left it.
+    pub(crate) fn take_in(&mut self, algorithm: &dyn Algorithm) {
         algorithm.publish(&mut self.latest);
-        let weight = self.weight.max(BEGINNING / (BEGINNING + algorithm.updates() as f32));
+        let weight = self
+            .weight
+            .max(BEGINNING / (BEGINNING + algorithm.updates() as f32));
         for (average, latest) in self.values.iter_mut().zip(&self.latest) {
             *average += weight * (latest - *average);
         }
@@ -43,13 +47,16 @@ impl Average {
     ///
     /// # Panics
     /// When `into` is not as long as the policy's part of a snapshot.
-    pub fn publish(&self, into: &mut [f32]) {
+    pub(crate) fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.values);
     }
 }
 
-impl Stateful for Average {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        vec![("policy_average".to_owned(), Part::Numbers(&mut self.values))]
+impl Stateful for PolicyAverage {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
+        vec![(
+            "policy_average".to_owned(),
+            StatePart::Numbers(&mut self.values),
+        )]
     }
 }

@@ -1,4 +1,4 @@
-//! A minibatch, from the replay's slices to tensors: what algorithms on libtorch learn from.
+//! A minibatch as tensors: what algorithms on libtorch learn from.
 
 use skein_protocol::ACTION;
 use tch::{Device, Tensor};
@@ -7,9 +7,9 @@ use crate::algorithm::{Columns, Inputs};
 use crate::networks::pixels;
 use crate::vae::images_from_bytes;
 
-/// A minibatch on the learner's device; see [`Columns`] for the columns.
+/// A minibatch on the learner's device. [`Columns`] documents the columns and their shapes.
 #[derive(Debug)]
-pub(crate) struct Batch {
+pub(crate) struct TensorBatch {
     pub(crate) observations: Tensor,
     pub(crate) actions: Tensor,
     pub(crate) rewards: Tensor,
@@ -17,18 +17,21 @@ pub(crate) struct Batch {
     pub(crate) states: Tensor,
     pub(crate) next_states: Tensor,
     pub(crate) terminated: Tensor,
-    /// Depth images of the observations and of the next ones, `[n, 1, 72, 128]` each, in [0, 1]; where the encoder is trained end to end.
+    /// Depth images before and after the action, `[rows, 1, 72, 128]` each, in [0, 1]. Present only
+    /// where the encoder is trained end to end.
     pub(crate) images: Option<[Tensor; 2]>,
 }
 
-impl Batch {
-    /// Copies the columns to the device, once each.
+impl TensorBatch {
+    /// Copies each column to the device.
     ///
     /// # Panics
-    /// When the columns have different numbers of rows, or none.
+    /// When the columns differ in their number of rows, or have none.
     pub(crate) fn new(columns: Columns<'_>, inputs: Inputs, device: Device) -> Self {
         let rows = columns.check(inputs) as i64;
-        let column = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape).to_device(device);
+        let column = |values: &[f32], shape: &[i64]| {
+            Tensor::from_slice(values).view(shape).to_device(device)
+        };
         let [observation, state] = [inputs.policy, inputs.critic].map(|width| width as i64);
         let seen = |bytes| pixels(&images_from_bytes(bytes).to_device(device));
         Self {
@@ -43,7 +46,7 @@ impl Batch {
         }
     }
 
-    /// Transitions in the batch.
+    /// Number of transitions.
     pub(crate) fn rows(&self) -> i64 {
         self.rewards.size()[0]
     }

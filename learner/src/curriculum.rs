@@ -1,24 +1,29 @@
-//! Which flight is flown where: tickets as a function of configuration, seed and flight number.
+//! Assigns courses, levels and seeds to episodes: tickets are a function of configuration, seed and
+//! episode number.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::ACTION;
 use skein_protocol::config::{Config, ConfirmOn};
-use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion, RunId};
-use skein_protocol::leg::Leg;
+use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
+use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
-/// Evaluations are numbered this far apart, so that no two of their flights share a number.
+/// Distance between the first episode numbers of two evaluations, so that no number occurs twice.
 const EVALUATION_STRIDE: u64 = 1 << 24;
 
-/// Epochs of the whole run; the last may be shorter.
-pub fn epochs(config: &Config) -> u64 {
-    config.run.flights.div_ceil(config.learning.flights_per_epoch)
+/// Number of epochs of the whole run; the last one may be shorter.
+pub(crate) fn epochs(config: &Config) -> u64 {
+    config
+        .run
+        .episodes
+        .div_ceil(config.learning.episodes_per_epoch)
 }
 
-/// Tickets of `epoch`, in flight order. Where flights are flown in legs, there is one flight, and `flown` are the actions of its legs so far, from take-off on.
-pub fn training(
+/// Tickets of `epoch`, in episode order. With episodes flown in segments, an epoch is one episode,
+/// and `flown` holds the actions of its segments so far, from the reset on.
+pub(crate) fn training(
     config: &Config,
     run: RunId,
     epoch: Epoch,
@@ -26,74 +31,88 @@ pub fn training(
     exploration: Exploration,
     flown: &[[f32; ACTION]],
 ) -> Vec<Ticket> {
-    let first = epoch.0 * config.learning.flights_per_epoch;
-    let end = (first + config.learning.flights_per_epoch).min(config.run.flights);
-    let ticket = |flight| Ticket {
+    let first = epoch.0 * config.learning.episodes_per_epoch;
+    let end = (first + config.learning.episodes_per_epoch).min(config.run.episodes);
+    let ticket = |episode| Ticket {
         run,
-        flight: FlightId(flight),
+        episode: EpisodeId(episode),
         attempt: Attempt(0),
         policy_version: version,
-        course: training_course(config, flight),
-        start_level: start_level(config, flight),
+        course: training_course(config, episode),
+        start_level: start_level(config, episode),
         exploration,
-        seed: derive(config.run.seed, Purpose::Flight, flight),
-        leg: config.learning.in_legs().then(|| Leg {
-            steps: config.learning.leg_steps as u32,
-            flown: flown.into(),
+        seed: derive(config.run.seed, Purpose::Episode, episode),
+        segment: config.learning.in_segments().then(|| Segment {
+            steps: config.learning.segment_steps as u32,
+            prior_actions: flown.into(),
         }),
     };
     (first..end).map(ticket).collect()
 }
 
-/// Tickets of `flights` evaluation flights on each of `courses`, course by course.
+/// Tickets of `episodes` evaluation episodes on each of `courses`, course by course.
 ///
-/// Flight i has the same seed on every course and in every evaluation, so that snapshots are compared on the same starts. `evaluation` numbers the
-/// evaluations of a run.
-pub fn evaluation(
+/// Episode i has the same seed on every course and in every evaluation, so that snapshots are
+/// compared on the same starts. `evaluation` numbers the evaluations of a run.
+pub(crate) fn evaluation(
     config: &Config,
     run: RunId,
     evaluation: u64,
     version: PolicyVersion,
     courses: std::ops::Range<u32>,
-    flights: u64,
+    episodes: u64,
 ) -> Vec<Ticket> {
-    let first = FlightId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
-    let ticket = |(number, (course, flight))| Ticket {
+    let first = EpisodeId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
+    let ticket = |(number, (course, episode))| Ticket {
         run,
-        flight: FlightId(first + number),
+        episode: EpisodeId(first + number),
         attempt: Attempt(0),
         policy_version: version,
         course: CourseChoice::Evaluation(course),
         start_level: 1,
         exploration: Exploration::Mode,
-        seed: derive(config.run.seed, Purpose::EvaluationFlight, flight),
-        leg: None,
+        seed: derive(config.run.seed, Purpose::EvaluationEpisode, episode),
+        segment: None,
     };
-    let flown = courses.flat_map(|course| (0..flights).map(move |flight| (course, flight)));
+    let flown = courses.flat_map(|course| (0..episodes).map(move |episode| (course, episode)));
     (0..).zip(flown).map(ticket).collect()
 }
 
-/// Tickets of the flights that confirm a candidate for the best snapshot. Generated courses are the same ones for each candidate, and none of them is trained on.
-pub fn confirmation(config: &Config, run: RunId, number: u64, version: PolicyVersion) -> Vec<Ticket> {
-    let mut tickets = evaluation(config, run, number, version, 0..1, config.evaluation.confirm_flights);
+/// Tickets of the confirmation episodes for a candidate. Generated courses are the same for every
+/// candidate, and training never uses them.
+pub(crate) fn confirmation(
+    config: &Config,
+    run: RunId,
+    number: u64,
+    version: PolicyVersion,
+) -> Vec<Ticket> {
+    let mut tickets = evaluation(
+        config,
+        run,
+        number,
+        version,
+        0..1,
+        config.evaluation.confirm_episodes,
+    );
     if config.evaluation.confirm_on == ConfirmOn::Generated {
-        for (flight, ticket) in (0..).zip(&mut tickets) {
-            let course = derive(config.run.seed, Purpose::ConfirmationCourse, flight);
+        for (episode, ticket) in (0..).zip(&mut tickets) {
+            let course = derive(config.run.seed, Purpose::ConfirmationCourse, episode);
             ticket.course = CourseChoice::Generated(course);
         }
     }
     tickets
 }
 
-/// The level training flight `flight` starts at: the next one every few flights, then the first again (paper, section 4.2).
-fn start_level(config: &Config, flight: u64) -> u8 {
-    let step = flight / config.learning.flights_per_level;
+/// Start level of training episode `episode`: the next level every few episodes, then level 1 again
+/// (the paper, section 4.2).
+fn start_level(config: &Config, episode: u64) -> u8 {
+    let step = episode / config.learning.episodes_per_level;
     (step % u64::from(config.learning.levels)) as u8 + 1
 }
 
-/// Where training flight `flight` is flown.
-fn training_course(config: &Config, flight: u64) -> CourseChoice {
-    let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, flight));
+/// Course of training episode `episode`.
+fn training_course(config: &Config, episode: u64) -> CourseChoice {
+    let mut rng = Pcg64Mcg::seed_from_u64(derive(config.run.seed, Purpose::Course, episode));
     if rng.random::<f64>() < config.courses.generated_share {
         CourseChoice::Generated(rng.random())
     } else {
@@ -123,18 +142,24 @@ mod tests {
     }
 
     #[test]
-    fn every_flight_is_in_exactly_one_epoch() {
+    fn every_episode_is_in_exactly_one_epoch() {
         let mut config = Config::default();
-        (config.run.flights, config.learning.flights_per_epoch) = (23, 10);
-        let flights: Vec<u64> = tickets(&config).iter().map(|ticket| ticket.flight.0).collect();
-        assert_eq!(flights, (0..23).collect::<Vec<_>>());
+        (config.run.episodes, config.learning.episodes_per_epoch) = (23, 10);
+        let episodes: Vec<u64> = tickets(&config)
+            .iter()
+            .map(|ticket| ticket.episode.0)
+            .collect();
+        assert_eq!(episodes, (0..23).collect::<Vec<_>>());
     }
 
     #[test]
-    fn the_start_level_rises_every_ten_flights_and_returns() {
+    fn the_start_level_rises_every_ten_episodes_and_returns() {
         let mut config = Config::default();
-        config.run.flights = 60;
-        let levels: Vec<u8> = tickets(&config).iter().map(|ticket| ticket.start_level).collect();
+        config.run.episodes = 60;
+        let levels: Vec<u8> = tickets(&config)
+            .iter()
+            .map(|ticket| ticket.start_level)
+            .collect();
         assert_eq!(
             levels.chunks(10).map(|chunk| chunk[0]).collect::<Vec<_>>(),
             [1, 2, 3, 4, 5, 1]
@@ -149,7 +174,7 @@ mod tests {
     #[test]
     fn the_generated_share_is_about_the_configured_one_and_courses_differ() {
         let mut config = Config::default();
-        (config.run.flights, config.courses.generated_share) = (1000, 0.25);
+        (config.run.episodes, config.courses.generated_share) = (1000, 0.25);
         let generated: std::collections::BTreeSet<u64> = tickets(&config)
             .iter()
             .filter_map(|ticket| match ticket.course {
@@ -167,9 +192,15 @@ mod tests {
     #[test]
     fn candidates_are_confirmed_on_the_same_generated_courses_which_are_not_trained_on() {
         let mut config = Config::default();
-        (config.run.flights, config.courses.generated_share) = (1000, 1.0);
-        let courses = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.course).collect::<HashSet<_>>();
-        let confirmed = |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
+        (config.run.episodes, config.courses.generated_share) = (1000, 1.0);
+        let courses = |tickets: &[Ticket]| {
+            tickets
+                .iter()
+                .map(|ticket| ticket.course)
+                .collect::<HashSet<_>>()
+        };
+        let confirmed =
+            |config: &Config, number| confirmation(config, RunId(1), number, PolicyVersion(number));
         assert_eq!(
             courses(&confirmed(&config, 0)),
             HashSet::from([CourseChoice::Evaluation(0)])
@@ -189,13 +220,14 @@ mod tests {
         let config = Config::default();
         let first = evaluation(&config, RunId(1), 0, PolicyVersion(3), 0..2, 5);
         let second = evaluation(&config, RunId(1), 1, PolicyVersion(4), 0..1, 5);
-        let seeds = |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.seed).collect::<Vec<_>>();
+        let seeds =
+            |tickets: &[Ticket]| tickets.iter().map(|ticket| ticket.seed).collect::<Vec<_>>();
         assert_eq!(seeds(&first[..5]), seeds(&second));
         assert_eq!(seeds(&first[..5]), seeds(&first[5..]));
         assert!(
             first
                 .iter()
-                .all(|ticket| second.iter().all(|other| other.flight != ticket.flight))
+                .all(|ticket| second.iter().all(|other| other.episode != ticket.episode))
         );
         assert!(
             first

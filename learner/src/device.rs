@@ -1,32 +1,34 @@
-//! Where the learner computes.
+//! The device that the learner computes on.
 
 use skein_protocol::config;
 use tch::{Cuda, Device};
 
-/// Why the configured device cannot be used.
+/// Reason why the configured device cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DeviceError {
-    /// libtorch knows no CUDA at all.
+    /// This libtorch has no CUDA at all.
     #[error(
-        "run.device = cuda:{number}: this libtorch has no CUDA; set run.device = \"cpu\", or build with LIBTORCH naming a CUDA build of libtorch 2.13"
+        "run.device = cuda:{number}: this libtorch has no CUDA; set run.device = \"cpu\", \
+         or build with LIBTORCH naming a CUDA build of libtorch 2.13"
     )]
     WithoutCuda {
-        /// The device asked for.
+        /// Number of the requested device.
         number: usize,
     },
-    /// libtorch knows CUDA, but there is no such device.
+    /// libtorch has CUDA, but not this device.
     #[error(
-        "run.device = cuda:{number}: libtorch finds {count} CUDA devices, numbered from 0; see nvidia-smi, or set run.device = \"cpu\""
+        "run.device = cuda:{number}: libtorch finds {count} CUDA devices, numbered from 0; \
+         see nvidia-smi, or set run.device = \"cpu\""
     )]
     NoSuchDevice {
-        /// The device asked for.
+        /// Number of the requested device.
         number: usize,
-        /// Devices there are.
+        /// Number of devices found.
         count: i64,
     },
 }
 
-/// The tensor library's name for the configured device, once it is sure that tensors can live there.
+/// Returns libtorch's name for the configured device, after checking that it exists.
 ///
 /// # Errors
 /// [`DeviceError`] says what is missing and what to do.
@@ -41,14 +43,16 @@ pub fn open(device: config::Device) -> Result<Device, DeviceError> {
             if number as i64 >= count {
                 return Err(DeviceError::NoSuchDevice { number, count });
             }
-            // Choosing convolution algorithms by timing them would make results depend on the machine's load.
+            // With benchmarking, cuDNN chooses algorithms by timing them, and results would depend
+            // on the machine's load.
             Cuda::cudnn_set_benchmark(false);
             Ok(Device::Cuda(number))
         }
     }
 }
 
-/// Sets how many threads tensor operations of the calling thread use; part of the result, as another count sums in another order.
+/// Sets the number of threads for the calling thread's tensor operations. It affects the result:
+/// another count sums in another order.
 pub fn use_threads(count: usize) {
     tch::set_num_threads(count as i32);
 }
@@ -62,13 +66,14 @@ mod tests {
         let error = open(config::Device::Cuda(1000)).unwrap_err();
         let text = error.to_string();
         assert!(
-            text.starts_with("run.device = cuda:1000: ") && text.contains("set run.device = \"cpu\""),
+            text.starts_with("run.device = cuda:1000: ")
+                && text.contains("set run.device = \"cpu\""),
             "{text}"
         );
     }
 
     #[test]
-    fn the_processor_is_always_there() {
+    fn the_cpu_is_always_available() {
         assert_eq!(open(config::Device::Cpu), Ok(Device::Cpu));
     }
 }

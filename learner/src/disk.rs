@@ -1,8 +1,9 @@
 //! A full disk pauses the learner and loses nothing.
 //!
-//! Whoever writes and finds no room warns, waits, and tries again until there is room or the run is told to stop; what was learned stays in memory
-//! meanwhile. Files that are written whole are written again ([`Disk::with_room`]); to those that are appended to, what is missing is appended
-//! ([`Patient`]), so that nothing is in them twice. Any other failure is for the caller.
+//! A writer that finds no room warns, waits, and tries again until there is room or the run must
+//! stop. What was learned stays in memory meanwhile. [`Disk::with_room`] repeats the write of a
+//! whole file; [`PatientWriter`] continues a file that is appended to, so that nothing is written
+//! twice. Every other failure is returned to the caller.
 
 use std::error::Error;
 use std::io::{self, ErrorKind, Write};
@@ -13,12 +14,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Between two attempts to write.
+/// Time between two attempts to write.
 const PAUSE: Duration = Duration::from_secs(1);
-/// Between two warnings.
+/// Time between two warnings.
 const WARN_EVERY: Duration = Duration::from_secs(60);
 
-/// The disk, as those who write see it.
+/// The run's disk, shared by all who write to it.
 #[derive(Debug, Clone)]
 pub struct Disk {
     stop: Arc<AtomicBool>,
@@ -27,7 +28,7 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// The disk of a learner that `stop` tells to end; then nobody waits any more.
+    /// Returns the disk of a learner that ends when `stop` is set; then no writer waits any longer.
     pub fn new(stop: Arc<AtomicBool>) -> Self {
         Self {
             stop,
@@ -36,15 +37,18 @@ impl Disk {
         }
     }
 
-    /// What waits for room at the moment.
+    /// Description of the write that waits for room at the moment.
     pub fn waiting(&self) -> Option<String> {
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        self.waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
-    /// Repeats `attempt`, which writes `path` anew each time, as long as it fails because the disk is full.
+    /// Repeats `attempt`, which writes all of `path` each time, as long as the disk is full.
     ///
     /// # Errors
-    /// What it fails of otherwise; that the disk is full, once the run is told to stop.
+    /// Returns any other failure at once, and the full disk itself once the run must stop.
     pub fn with_room<T, E: Error + 'static>(
         &self,
         path: &Path,
@@ -54,16 +58,17 @@ impl Disk {
         loop {
             match attempt() {
                 Err(error) if is_full(&error) && !self.stop.load(Ordering::Relaxed) => {
-                    wait.get_or_insert_with(|| Wait::of(self)).once_more(path, &error);
+                    wait.get_or_insert_with(|| Wait::of(self))
+                        .once_more(path, &error);
                 }
                 result => return result,
             }
         }
     }
 
-    /// A writer to the file at `path` that waits for room.
-    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> Patient<W> {
-        Patient {
+    /// Returns a writer to the file at `path` that waits for room.
+    pub fn patient<W: Write>(&self, path: &Path, inner: W) -> PatientWriter<W> {
+        PatientWriter {
             disk: self.clone(),
             path: path.to_owned(),
             inner,
@@ -71,14 +76,19 @@ impl Disk {
     }
 }
 
-/// Whether `error`, or what caused it, is that there is no room.
+/// `true` if `error`, or one of its causes, is a full disk or an exceeded quota.
 fn is_full(error: &(dyn Error + 'static)) -> bool {
     successors(Some(error), |&error| error.source())
         .filter_map(|error| error.downcast_ref::<io::Error>())
-        .any(|error| matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded))
+        .any(|error| {
+            matches!(
+                error.kind(),
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded
+            )
+        })
 }
 
-/// Somebody who waits for room.
+/// A write that waits for room.
 struct Wait<'a> {
     disk: &'a Disk,
     warned: Option<Instant>,
@@ -90,35 +100,46 @@ impl<'a> Wait<'a> {
     }
 
     fn once_more(&mut self, path: &Path, error: &dyn Error) {
-        if self.warned.is_none_or(|warned| warned.elapsed() >= WARN_EVERY) {
+        if self
+            .warned
+            .is_none_or(|warned| warned.elapsed() >= WARN_EVERY)
+        {
             self.warned = Some(Instant::now());
-            tracing::warn!(path = %path.display(), %error, "the disk is full; training waits for room");
+            tracing::warn!(path = %path.display(), %error, "disk full: training waits for room");
         }
-        let text = format!("waits for room on the disk to write {}", path.display());
-        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = Some(text);
+        let text = format!("waiting for room on the disk to write {}", path.display());
+        *self
+            .disk
+            .waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = Some(text);
         thread::sleep(self.disk.pause);
     }
 }
 
 impl Drop for Wait<'_> {
     fn drop(&mut self) {
-        // Another one who waits says so again within a pause.
-        *self.disk.waiting.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        // Another waiting writer sets its own text again within one pause.
+        *self
+            .disk
+            .waiting
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner) = None;
     }
 }
 
-/// Writes what there is room for, and waits for the rest: see [`Disk::patient`].
+/// A writer that waits for room instead of failing: see [`Disk::patient`].
 #[derive(Debug)]
-pub struct Patient<W> {
+pub struct PatientWriter<W> {
     disk: Disk,
     path: PathBuf,
     inner: W,
 }
 
-impl<W: Write> Write for Patient<W> {
+impl<W: Write> Write for PatientWriter<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Self { disk, path, inner } = self;
-        // The system says no room only when it took nothing of these bytes.
+        // The system reports a full disk only if it took none of these bytes.
         disk.with_room(path, || inner.write(bytes))
     }
 
@@ -132,19 +153,19 @@ impl<W: Write> Write for Patient<W> {
 mod tests {
     use super::*;
 
-    /// A disk that has room again after so many attempts.
-    struct Small {
+    /// A disk that has room again after `refusals` attempts.
+    struct SmallDisk {
         written: Vec<u8>,
         refusals: usize,
     }
 
-    impl Write for Small {
+    impl Write for SmallDisk {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
             if self.written.len() >= 5 && self.refusals > 0 {
                 self.refusals -= 1;
                 return Err(ErrorKind::StorageFull.into());
             }
-            // Never all at once, as a disk that is nearly full.
+            // Never all bytes at once, like a disk that is nearly full.
             let taken = bytes.len().min(3);
             self.written.extend_from_slice(&bytes[..taken]);
             Ok(taken)
@@ -165,11 +186,12 @@ mod tests {
     #[test]
     fn what_waited_for_room_is_written_once() {
         let disk = disk();
-        let small = Small {
+        let small = SmallDisk {
             written: Vec::new(),
             refusals: 4,
         };
-        let mut writer = io::BufWriter::with_capacity(4, disk.patient(Path::new("flights.csv"), small));
+        let mut writer =
+            io::BufWriter::with_capacity(4, disk.patient(Path::new("episodes.csv"), small));
         for text in ["one,", "two,", "three,", "four"] {
             writer.write_all(text.as_bytes()).unwrap();
         }
@@ -180,11 +202,11 @@ mod tests {
     }
 
     #[test]
-    fn whoever_waits_says_for_what_until_told_to_stop() {
+    fn a_waiting_write_is_reported_until_the_run_stops() {
         let disk = disk();
         let for_thread = disk.clone();
         let waiting = thread::spawn(move || {
-            for_thread.with_room(Path::new("/somewhere/flight-3"), || {
+            for_thread.with_room(Path::new("/somewhere/episode-3"), || {
                 Err::<(), _>(io::Error::from(ErrorKind::QuotaExceeded))
             })
         });
@@ -192,9 +214,12 @@ mod tests {
         while disk.waiting().is_none() && Instant::now() < end {
             thread::sleep(Duration::from_millis(1));
         }
-        assert!(disk.waiting().unwrap().contains("/somewhere/flight-3"));
+        assert!(disk.waiting().unwrap().contains("/somewhere/episode-3"));
         disk.stop.store(true, Ordering::Relaxed);
-        assert_eq!(waiting.join().unwrap().unwrap_err().kind(), ErrorKind::QuotaExceeded);
+        assert_eq!(
+            waiting.join().unwrap().unwrap_err().kind(),
+            ErrorKind::QuotaExceeded
+        );
     }
 
     #[test]
@@ -204,6 +229,9 @@ mod tests {
             attempts += 1;
             Err::<(), _>(io::Error::from(ErrorKind::PermissionDenied))
         });
-        assert_eq!((error.unwrap_err().kind(), attempts), (ErrorKind::PermissionDenied, 1));
+        assert_eq!(
+            (error.unwrap_err().kind(), attempts),
+            (ErrorKind::PermissionDenied, 1)
+        );
     }
 }

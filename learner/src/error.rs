@@ -1,25 +1,27 @@
-//! What can go wrong in an update.
+//! Errors of an update.
 
 use tch::Tensor;
 
-/// Why an update was not done.
+/// Reason why an update was not made.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UpdateError {
     /// A loss, a metric or a gradient is infinite or not a number.
     #[error(
-        "{tensor} is not finite in update {update}: learning has diverged or its data are damaged; try a smaller learning rate, or resume from a checkpoint"
+        "{tensor} is not finite in update {update}: learning has diverged or its data are damaged; \
+         try a smaller learning rate, or resume from a checkpoint"
     )]
     NonFinite {
-        /// What.
+        /// Name of the loss, metric or gradient.
         tensor: &'static str,
-        /// The update's number, from 1.
+        /// Number of the update, from 1.
         update: u64,
     },
 }
 
-/// The values of scalar tensors, once they and all of the gradients are known to be finite.
+/// Returns the values of scalar tensors, after checking that they and all gradients are finite.
 ///
-/// One transfer from the device for all of them. A gradient counts as not finite when its squared norm overflows as well.
+/// All of them are transferred from the device at once. A gradient whose squared norm overflows
+/// also counts as not finite.
 pub(crate) fn finite<const SCALARS: usize, const GRADIENTS: usize>(
     update: u64,
     scalars: [(&'static str, &Tensor); SCALARS],
@@ -40,7 +42,8 @@ pub(crate) fn finite<const SCALARS: usize, const GRADIENTS: usize>(
     Ok(std::array::from_fn(|place| numbers[place]))
 }
 
-/// Looks whether everything that update number `update` computed is a number; the first that is not is named.
+/// Checks that everything update number `update` computed is finite; the error names the first
+/// number that is not.
 pub(crate) fn must_be_finite(
     update: u64,
     numbers: impl IntoIterator<Item = (&'static str, f32)>,

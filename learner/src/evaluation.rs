@@ -1,4 +1,5 @@
-//! What is written of the final evaluation: the report, where the flights flew, and what the VAE makes of what they saw.
+//! Output files of the final evaluation: the report, the trajectories, and images with their
+//! reconstructions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,50 +7,51 @@ use std::path::{Path, PathBuf};
 use safetensors::tensor::{Dtype, TensorView};
 use serde::Serialize;
 use skein_protocol::config::{Config, CoursesSection};
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::run::RunDirectory;
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_run::RunDirectory;
+use skein_run::durable;
 
-use crate::flight::CommittedFlight;
+use crate::episode::CommittedEpisode;
 use crate::trainer::Trainer;
 
-/// Flights a course of which the path is written.
-const PATHS: usize = 25;
-/// Images that are shown beside their reconstructions.
+/// Episodes per course whose trajectory is written.
+const TRAJECTORIES: usize = 25;
+/// Number of images shown beside their reconstructions.
 const PICTURES: usize = 8;
 
-/// Why an evaluation cannot be written.
+/// Reason why an evaluation cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write {}: {source}", path.display())]
-pub struct EvaluationError {
-    /// The file.
+pub struct EvaluationWriteError {
+    /// Path of the file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
-/// Puts `content` in the place of the file at `path`, at once or not at all.
-fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationError>
+/// Replaces the file at `path` by `content`, completely or not at all.
+fn replace<E>(path: &Path, content: Result<Vec<u8>, E>) -> Result<(), EvaluationWriteError>
 where
     E: Into<Box<dyn std::error::Error + Send + Sync>>,
 {
     content
         .map_err(io::Error::other)
         .and_then(|bytes| durable::replace(path, &bytes))
-        .map_err(|source| EvaluationError {
+        .map_err(|source| EvaluationWriteError {
             path: path.to_owned(),
             source,
         })
 }
 
-/// A row of `evaluation_paths.csv`.
+/// A row of `evaluation_trajectories.csv`.
 #[derive(Debug, Serialize)]
-struct PathRow<'a> {
+struct TrajectoryRow<'a> {
     course: &'a str,
-    flight: usize,
+    episode: usize,
     step: usize,
     x_m: f32,
     y_m: f32,
@@ -57,89 +59,95 @@ struct PathRow<'a> {
     outcome: Outcome,
 }
 
-/// Writes `evaluation.json` and `evaluation_paths.csv` from the evaluation flights of all courses, course by course.
+/// Writes `evaluation.json` and `evaluation_trajectories.csv` from the evaluation episodes of all
+/// courses, course by course.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
-pub fn write_report(
+/// [`EvaluationWriteError`] names the file.
+pub(crate) fn write_report(
     directory: &RunDirectory,
     config: &Config,
     policy_version: PolicyVersion,
     policy_sha256: &str,
-    flown: &[CommittedFlight],
-) -> Result<EvaluationReport, EvaluationError> {
-    let mut paths = csv::Writer::from_writer(Vec::new());
+    flown: &[CommittedEpisode],
+) -> Result<EvaluationReport, EvaluationWriteError> {
+    let mut trajectories = csv::Writer::from_writer(Vec::new());
     let mut rows = Ok(());
     let mut courses = Vec::new();
-    for (course, flights) in config
-        .courses
-        .evaluation
+    for (name, episodes) in CoursesSection::names(&config.courses.evaluation)
         .iter()
-        .zip(flown.chunks(config.evaluation.flights as usize))
+        .zip(flown.chunks(config.evaluation.episodes as usize))
     {
-        let name = CoursesSection::name_of(course);
-        let scores: Vec<FlightScore> = flights.iter().map(score).collect();
-        let walls = flights.first().map_or(0, |flight| flight.course_walls.into());
-        courses.push(CourseEvaluation::of(&name, walls, &scores));
-        for (number, flight) in flights.iter().take(PATHS).enumerate() {
-            rows = rows.and_then(|()| write_path(&mut paths, &name, number, flight));
+        let scores: Vec<EpisodeScore> = episodes.iter().map(score).collect();
+        let walls = episodes
+            .first()
+            .map_or(0, |episode| episode.course_walls.into());
+        courses.push(CourseEvaluation::of(name, walls, &scores));
+        for (number, episode) in episodes.iter().take(TRAJECTORIES).enumerate() {
+            rows = rows.and_then(|()| write_trajectory(&mut trajectories, name, number, episode));
         }
     }
-    let paths = rows
-        .map_err(io::Error::from)
-        .and_then(|()| paths.into_inner().map_err(|error| io::Error::other(error.to_string())));
-    replace(&directory.evaluation_paths_csv(), paths)?;
+    let trajectories = rows.map_err(io::Error::from).and_then(|()| {
+        trajectories
+            .into_inner()
+            .map_err(|error| io::Error::other(error.to_string()))
+    });
+    replace(&directory.evaluation_trajectories_csv(), trajectories)?;
     let report = EvaluationReport {
         policy_version,
         policy_sha256: policy_sha256.to_owned(),
         courses,
     };
-    replace(&directory.evaluation_json(), serde_json::to_vec_pretty(&report))?;
+    replace(
+        &directory.evaluation_json(),
+        serde_json::to_vec_pretty(&report),
+    )?;
     Ok(report)
 }
 
-fn score(flight: &CommittedFlight) -> FlightScore {
-    FlightScore {
-        walls_passed: flight.walls_passed.into(),
-        flight_return: flight.total_reward().into(),
-        outcome: flight.ending(),
-        hit_wall: flight.hit_wall,
+fn score(episode: &CommittedEpisode) -> EpisodeScore {
+    EpisodeScore {
+        walls_passed: episode.walls_passed.into(),
+        episode_return: episode.total_reward().into(),
+        outcome: episode.ending(),
+        hit_wall: episode.hit_wall,
     }
 }
 
-fn write_path(
-    paths: &mut csv::Writer<Vec<u8>>,
+fn write_trajectory(
+    trajectories: &mut csv::Writer<Vec<u8>>,
     course: &str,
     number: usize,
-    flight: &CommittedFlight,
+    episode: &CommittedEpisode,
 ) -> Result<(), csv::Error> {
-    for (step, observation) in flight.observations.iter().enumerate() {
+    for (step, observation) in episode.observations.iter().enumerate() {
         let [x_m, y_m, z_m] = observation.position_m;
-        paths.serialize(PathRow {
+        trajectories.serialize(TrajectoryRow {
             course,
-            flight: number,
+            episode: number,
             step,
             x_m,
             y_m,
             z_m,
-            outcome: flight.ending(),
+            outcome: episode.ending(),
         })?;
     }
     Ok(())
 }
 
-/// Writes depth images of a flight beside their reconstructions, `reconstructions.safetensors`; nothing where there is no VAE.
+/// Writes some depth images beside their reconstructions, `reconstructions.safetensors`. Writes
+/// nothing where there is no VAE.
 ///
 /// # Errors
-/// [`EvaluationError`] names the file.
-pub fn write_reconstructions(
+/// [`EvaluationWriteError`] names the file.
+pub(crate) fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
-    flights: &[CommittedFlight],
-) -> Result<(), EvaluationError> {
-    let depth = flights
+    episodes: &[CommittedEpisode],
+) -> Result<(), EvaluationWriteError> {
+    let depth = episodes
         .iter()
-        .filter_map(|flight| flight.depth.as_deref())
+        .filter_map(|episode| episode.depth.as_deref())
         .flat_map(|depth| depth.chunks(IMAGE_PIXELS));
     let images: Vec<&[u8]> = depth.collect();
     let stride = (images.len() / PICTURES).max(1);

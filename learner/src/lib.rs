@@ -1,37 +1,40 @@
-//! The learner: hands out tickets, commits the flights flown for them, trains VAE and policy on them, and publishes snapshots.
+//! The learner: hands out tickets, commits the episodes flown for them, trains VAE and policy, and
+//! publishes snapshots.
 //!
-//! Training is a function of configuration and seed: flights are taken in flight order, every random draw has a seed of its own, and nothing here
-//! depends on who flew a flight, or when.
+//! Training is a function of configuration and seed. Episodes are learned from in episode order,
+//! every random draw has its own seed, and nothing depends on which actor flew an episode, or when.
 
 pub mod algorithm;
-pub mod average;
+mod average;
 mod batch;
-pub mod best;
+mod best;
 pub mod checkpoint;
-pub mod curriculum;
+mod curriculum;
 pub mod device;
 pub mod disk;
+pub mod episode;
+pub mod episodes;
 mod error;
-pub mod evaluation;
-pub mod flight;
-pub mod flights;
-pub mod lives;
+mod evaluation;
+mod faults;
+mod incarnations;
 pub mod metrics;
 mod mirror;
 pub mod networks;
 pub mod noise;
-pub mod optimizer;
+mod notice;
+mod optimizer;
 mod perception;
 pub mod replay;
-pub mod report;
+mod report;
 pub mod sac;
-pub mod spent;
+mod spent;
 pub mod state;
-pub mod td3;
+mod td3;
 pub mod threads;
-pub mod trainer;
+mod trainer;
 pub mod training;
 pub mod vae;
-pub mod watchdog;
+mod watchdog;
 
 pub use error::UpdateError;

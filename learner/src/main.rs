@@ -1,4 +1,4 @@
-//! `skein-learner --run DIR`: trains the run that was prepared in a directory.
+//! `skein-learner --run DIR`: trains the run prepared in a directory.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -8,16 +8,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_protocol::allocation::keep_freed_memory;
-use skein_protocol::failure::{EXIT_START_AGAIN, with_causes};
-use skein_protocol::logging::{LogFormat, log_to_file};
-use skein_protocol::run::{LearnerSeat, RunDirectory};
-use skein_protocol::summary::{Ending, Summary};
-use tokio::signal::unix::{SignalKind, signal};
+use skein_run::allocation::keep_freed_memory;
+use skein_run::failure::{EXIT_RESTART, with_causes};
+use skein_run::logging::{LogFormat, log_to_file};
+use skein_run::note;
+use skein_run::signals::is_ignored;
+use skein_run::{LearnerLock, RunDirectory};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// The learner of a run: hands out tickets, trains on the flights that come back, publishes snapshots. Started by run_local.sh.
+/// The learner of a run: hands out tickets, trains on the episodes that come back, publishes
+/// snapshots. Started by run_local.sh.
 ///
-/// It goes on from the newest undamaged checkpoint in the directory, if there is one. Progress goes to standard output, one JSON object a line. SIGTERM or SIGINT ends the training in order: what was learned is saved.
+/// Resumes from the newest undamaged checkpoint in the directory, if there is one. Prints progress
+/// to standard output, one JSON object per line. SIGTERM or SIGINT stops the training in order:
+/// what was learned is saved.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -34,16 +38,16 @@ fn main() -> ExitCode {
             let status = status_of(&error);
             let error = with_causes(error.as_ref());
             tracing::error!(error, "learner failed");
-            eprintln!("skein-learner: {error}");
+            note!("skein-learner: {error}");
             status
         }
     }
 }
 
-/// Exit status after `error`: whether starting again may help.
+/// Exit status after `error`: says whether starting again may help.
 fn status_of(error: &anyhow::Error) -> ExitCode {
     match error.downcast_ref::<TrainingError>() {
-        Some(error) if error.is_of_the_transport() => ExitCode::from(EXIT_START_AGAIN),
+        Some(error) if error.is_transport_failure() => ExitCode::from(EXIT_RESTART),
         _ => ExitCode::FAILURE,
     }
 }
@@ -51,42 +55,77 @@ fn status_of(error: &anyhow::Error) -> ExitCode {
 fn run(arguments: &Arguments) -> Result<()> {
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
-    // Before anything of the run is touched, the log included: there may be another learner.
-    let seat = LearnerSeat::take(&directory, &identity)?;
+    // Taken before any file of the run is touched, the log included: another learner may be
+    // running.
+    let lock = LearnerLock::take(&directory, &identity)?;
     let log = directory.learner_log();
-    log_to_file(&log, LogFormat::from_environment()).with_context(|| format!("cannot write {}", log.display()))?;
-    tracing::info!(run = %identity.run, life = %seat.life(), seed = config.run.seed, device = %config.run.device, "learner starts");
+    log_to_file(&log, LogFormat::from_environment())
+        .with_context(|| format!("cannot write {}", log.display()))?;
+    tracing::info!(
+        run = %identity.run,
+        incarnation = %lock.incarnation(),
+        seed = config.run.seed,
+        device = %config.run.device,
+        "learner starts"
+    );
     let stop = stop_on_signals().context("cannot listen to signals")?;
-    // A summary that cannot be read is made again, from the last checkpoint.
-    if Summary::of(&directory).is_some_and(|summary| summary.ending == Ending::Completed) {
+    // An unreadable summary counts as missing: it is written again, from the last checkpoint.
+    if directory
+        .summary()
+        .is_some_and(|summary| summary.is_of_whole(&config))
+    {
         let root = directory.root().display();
-        tracing::info!("the run is complete: nothing is left to do");
-        eprintln!("skein-learner: the run in {root} is complete: nothing is left to do");
+        tracing::info!("the run is complete: nothing left to do");
+        note!("skein-learner: the run in {root} is complete: nothing left to do");
         return Ok(());
     }
-    let summary = training::run(&directory, &identity, seat.life(), &config, &stop)?;
+    let summary = training::run(&directory, &identity, lock.incarnation(), &config, &stop)?;
     tracing::info!(ending = ?summary.ending, policy_sha256 = summary.policy_sha256, "learner ends");
     Ok(())
 }
 
-/// A flag that SIGTERM and SIGINT set.
+/// Returns a flag that SIGTERM and SIGINT set, unless they were ignored when this process started.
 fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()?;
     let (mut terminate, mut interrupt) = {
         let _entered = runtime.enter();
-        (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?)
+        (
+            listen(SignalKind::terminate())?,
+            listen(SignalKind::interrupt())?,
+        )
     };
-    std::thread::Builder::new().name("signals".to_owned()).spawn(move || {
-        runtime.block_on(async {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = interrupt.recv() => {}
-            }
-        });
-        tracing::info!("told to stop");
-        flag.store(true, Ordering::Relaxed);
-    })?;
+    std::thread::Builder::new()
+        .name("signals".to_owned())
+        .spawn(move || {
+            runtime.block_on(async {
+                tokio::select! {
+                    () = arrival(&mut terminate) => {}
+                    () = arrival(&mut interrupt) => {}
+                }
+            });
+            tracing::info!("stop requested");
+            flag.store(true, Ordering::Relaxed);
+        })?;
     Ok(stop)
+}
+
+/// Listens for a signal; `None` if it was ignored when this process started, and so stays ignored.
+fn listen(kind: SignalKind) -> std::io::Result<Option<Signal>> {
+    (!is_ignored(kind.as_raw_value()))
+        .then(|| signal(kind))
+        .transpose()
+}
+
+/// Waits for a signal, for ever if it is ignored.
+async fn arrival(signal: &mut Option<Signal>) {
+    match signal {
+        Some(signal) => {
+            signal.recv().await;
+        }
+        None => std::future::pending().await,
+    }
 }

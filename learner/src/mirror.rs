@@ -1,22 +1,29 @@
-//! A flight seen in a mirror: left and right change places.
+//! An episode seen in a mirror: left and right change places.
 //!
-//! Corridor, drone and reward are the same on both sides, so what is seen in the mirror is a flight, too, through another course that nobody had to fly. Only a stereo camera has sides: its shadows
-//! lie to the left of what is near, and in the mirror to the right, as if its second lens were on the other side.
+//! Corridor, drone and reward are symmetric, so a mirrored episode is a valid episode through
+//! another course, at no cost in flying. Only a stereo camera has sides: its shadows lie to the
+//! left of near objects. In the mirror they lie to the right, as if its second lens were on the
+//! other side.
 
 use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
 
-use crate::flight::{CommittedFlight, StepObservation};
+use crate::episode::{CommittedEpisode, StepObservation};
 
-/// Places in the ground truth of what points to the left: both openings' offsets, the distance from the middle, the gust.
+/// Indices of the ground truth's leftward numbers: both openings' offsets, the distance from the
+/// middle, and the gust.
 const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
-impl CommittedFlight {
-    /// The flight in the mirror. Latent codes are the unmirrored flight's: whoever needs them encodes the mirrored images.
+impl CommittedEpisode {
+    /// Returns the mirrored episode. Its latent codes are still the unmirrored ones: a caller that
+    /// needs codes encodes the mirrored images.
     #[must_use]
     pub fn mirrored(&self) -> Self {
         let mut mirrored = self.without_images();
         mirrored.action_before = turn(self.action_before);
-        mirrored.actions.iter_mut().for_each(|action| *action = turn(*action));
+        mirrored
+            .actions
+            .iter_mut()
+            .for_each(|action| *action = turn(*action));
         mirrored.observations.iter_mut().for_each(mirror);
         mirrored.depth = self.depth.clone();
         for row in mirrored
@@ -37,7 +44,7 @@ fn turn([left, up]: [f32; ACTION]) -> [f32; ACTION] {
 fn mirror(seen: &mut StepObservation) {
     seen.position_m[1] *= -1.0;
     seen.velocity_mps[1] *= -1.0;
-    // Roll and yaw are the other way round, pitch is not.
+    // Roll and yaw change sign, pitch does not.
     seen.orientation[0] *= -1.0;
     seen.orientation[2] *= -1.0;
     for place in TO_THE_LEFT {
@@ -52,11 +59,11 @@ mod tests {
     use skein_protocol::IMAGE_PIXELS;
     use skein_protocol::transition::Outcome;
 
-    use crate::flight::samples::{flight, with_images};
+    use crate::episode::samples::{episode, with_images};
 
     #[test]
-    fn a_flight_in_two_mirrors_is_the_flight() {
-        let mut flown = with_images(flight(3, 5, Outcome::Collided));
+    fn an_episode_in_two_mirrors_is_the_episode() {
+        let mut flown = with_images(episode(3, 5, Outcome::Collided));
         flown.depth.as_mut().unwrap()[IMAGE_PIXELS..][..3].copy_from_slice(&[1, 2, 3]);
         let mirrored = flown.mirrored();
         assert_eq!(mirrored.check(), Ok(()));

@@ -1,29 +1,31 @@
 //! Adam on flat vectors.
 //!
-//! Our own, because the library's optimizer keeps its state to itself: a resumed run could not continue bit for bit. On one flat vector the whole step
-//! is a handful of tensor operations.
+//! Skein has its own, because libtorch's optimizer does not expose its state, so a resumed run
+//! could not continue bit for bit. On one flat vector, a step is a handful of tensor operations.
 
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
-use crate::state::Part;
+use crate::state::StatePart;
 
 const BETA_1: f64 = 0.9;
 const BETA_2: f64 = 0.999;
 const EPSILON: f64 = 1e-8;
 
-/// Adam with its usual constants, β₁ = 0.9, β₂ = 0.999, ε = 1e-8 (Kingma and Ba 2015, arXiv:1412.6980, algorithm 1).
+/// Adam with its usual constants, β₁ = 0.9, β₂ = 0.999, ε = 1e-8 (Kingma and Ba 2015,
+/// arXiv:1412.6980, algorithm 1).
 #[derive(Debug)]
-pub struct Adam {
+pub(crate) struct Adam {
     learning_rate: f64,
     first_moment: Tensor,
     second_moment: Tensor,
-    /// Steps done, one i64 on the processor: a tensor like the rest of the state, so that it is stored and restored with it.
+    /// Steps done, one i64 on the CPU: a tensor like the rest of the state, so that it is stored
+    /// and restored with it.
     steps: Tensor,
 }
 
 impl Adam {
-    /// For a vector like `parameters`, before its first step.
-    pub fn new(parameters: &Tensor, learning_rate: f64) -> Self {
+    /// Starts an optimizer for a vector like `parameters`.
+    pub(crate) fn new(parameters: &Tensor, learning_rate: f64) -> Self {
         let zeros = || parameters.zeros_like();
         Self {
             learning_rate,
@@ -33,20 +35,21 @@ impl Adam {
         }
     }
 
-    /// Steps done so far.
-    pub fn steps(&self) -> u64 {
+    /// Number of steps done so far.
+    pub(crate) fn steps(&self) -> u64 {
         self.steps.int64_value(&[0]).unsigned_abs()
     }
 
-    /// One step of `parameters` against `gradient`, both of the shape given to [`Adam::new`].
-    pub fn step(&mut self, parameters: &mut Tensor, gradient: &Tensor) {
+    /// Makes one step of `parameters` against `gradient`, both of the shape given to [`Adam::new`].
+    pub(crate) fn step(&mut self, parameters: &mut Tensor, gradient: &Tensor) {
         let _guard = no_grad_guard();
         self.steps += 1;
         let steps = self.steps() as f64;
         // m ← β₁ m + (1 - β₁) g; v ← β₂ v + (1 - β₂) g²
         let _ = self.first_moment.lerp_(gradient, 1.0 - BETA_1);
         let _ = self.second_moment.lerp_(&gradient.square(), 1.0 - BETA_2);
-        // θ ← θ - lr · m̂ / (√v̂ + ε), where m̂ = m / (1 - β₁ᵗ) and v̂ = v / (1 - β₂ᵗ). The scalar factors are gathered in the denominator.
+        // θ ← θ - lr · m̂ / (√v̂ + ε), where m̂ = m / (1 - β₁ᵗ) and v̂ = v / (1 - β₂ᵗ). The
+        // denominator takes up the scalar factors.
         let bias_1 = 1.0 - BETA_1.powf(steps);
         let bias_2 = 1.0 - BETA_2.powf(steps);
         let denominator = self
@@ -58,14 +61,19 @@ impl Adam {
         let _ = parameters.addcdiv_(&self.first_moment, &denominator);
     }
 
-    /// The state under names that begin with `prefix`.
-    pub fn parts(&mut self, prefix: &str) -> Vec<(String, Part<'_>)> {
+    /// The state, under names that begin with `prefix`.
+    pub(crate) fn parts(&mut self, prefix: &str) -> Vec<(String, StatePart<'_>)> {
         [
             ("first_moment", &self.first_moment),
             ("second_moment", &self.second_moment),
             ("steps", &self.steps),
         ]
-        .map(|(name, tensor)| (format!("{prefix}.{name}"), Part::Tensor(tensor.shallow_clone())))
+        .map(|(name, tensor)| {
+            (
+                format!("{prefix}.{name}"),
+                StatePart::Tensor(tensor.shallow_clone()),
+            )
+        })
         .into()
     }
 }
@@ -79,7 +87,7 @@ mod tests {
     use crate::state::Stateful;
 
     impl Stateful for Adam {
-        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
             Adam::parts(self, "adam")
         }
     }
@@ -91,7 +99,8 @@ mod tests {
         // First step: m̂ = g and v̂ = g², so the parameter moves by lr · sign(g).
         adam.step(&mut parameters, &Tensor::from_slice(&[0.5_f32]));
         assert!((parameters.double_value(&[0]) - 0.9).abs() < 1e-6);
-        // Second step, g = -2: m = 0.9 · 0.05 - 0.2 = -0.155, v = 0.999 · 0.00025 + 0.004 = 0.00424975.
+        // Second step, g = -2: m = 0.9 · 0.05 - 0.2 = -0.155, v = 0.999 · 0.00025 + 0.004 =
+        // 0.00424975.
         adam.step(&mut parameters, &Tensor::from_slice(&[-2.0_f32]));
         let (first, second): (f64, f64) = (-0.155 / (1.0 - 0.81), 0.004_249_75 / (1.0 - 0.998_001));
         let expected = 0.9 - 0.1 * first / (second.sqrt() + 1e-8);

@@ -1,4 +1,4 @@
-//! What the learner tells while it runs: progress lines on standard output, and where its time goes.
+//! ProgressReport lines on standard output while the learner runs.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -7,46 +7,44 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 
 use crate::disk::Disk;
-use crate::flights::reception::Shared;
+use crate::episodes::ReceiverState;
 use crate::watchdog::Watchdog;
 
 /// Time between two lines.
 const INTERVAL: Duration = Duration::from_millis(500);
-/// How long the last line may take.
+/// Longest wait for the last line.
 const LAST_LINE_PATIENCE: Duration = Duration::from_secs(2);
-/// Rates are averaged over this many intervals.
+/// Number of intervals that rates are averaged over.
 const RATE_INTERVALS: usize = 10;
 
 /// Prints the learner's progress at intervals, whatever the training thread is doing.
 #[derive(Debug)]
-pub struct Reporter {
-    progress: Arc<Mutex<Progress>>,
+pub(crate) struct Reporter {
+    progress: Arc<Mutex<ProgressReport>>,
     ended: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// Says something to the user, by way of whoever reads the reports: a line that is none is shown as it is.
-pub fn tell(line: &str) {
-    tracing::warn!("{line}");
-    // Nobody may be listening; it is in the log.
-    let _ = writeln!(std::io::stdout().lock(), "{line}");
-}
-
 impl Reporter {
-    /// Starts reporting, with `progress` as the first line: in it `elapsed_secs` are those of earlier lives, to which this one's are added.
+    /// Starts reporting, with `progress` as the first line. Its `elapsed_secs` are those of earlier
+    /// incarnations; the time of this one is added.
     ///
     /// # Errors
     /// When the system grants no thread.
-    pub fn start(progress: Progress, reception: Arc<Shared>, disk: Disk) -> std::io::Result<Self> {
+    pub(crate) fn start(
+        progress: ProgressReport,
+        receiver: Arc<ReceiverState>,
+        disk: Disk,
+    ) -> std::io::Result<Self> {
         let progress = Arc::new(Mutex::new(progress));
         let ended = Arc::new(AtomicBool::new(false));
         let (of_thread, end_of_thread) = (progress.clone(), ended.clone());
         let thread = thread::Builder::new()
             .name("progress".to_owned())
-            .spawn(move || report(&of_thread, &end_of_thread, &reception, &disk))?;
+            .spawn(move || report(&of_thread, &end_of_thread, &receiver, &disk))?;
         Ok(Self {
             progress,
             ended,
@@ -54,8 +52,8 @@ impl Reporter {
         })
     }
 
-    /// Changes what the next line says.
-    pub fn update(&self, change: impl FnOnce(&mut Progress)) {
+    /// Changes the contents of the next line.
+    pub(crate) fn update(&self, change: impl FnOnce(&mut ProgressReport)) {
         change(&mut self.progress.lock().unwrap_or_else(PoisonError::into_inner));
     }
 }
@@ -63,32 +61,43 @@ impl Reporter {
 impl Drop for Reporter {
     fn drop(&mut self) {
         self.ended.store(true, Ordering::Relaxed);
-        let Some(thread) = self.thread.take() else { return };
-        // Whoever reads the lines may be frozen, and the pipe full: then the last lines are lost, and the thread ends with the process.
+        let Some(thread) = self.thread.take() else {
+            return;
+        };
+        // The reading process may be frozen and the pipe full. Then the last lines are lost, and
+        // the thread ends with the process.
         let deadline = Instant::now() + LAST_LINE_PATIENCE;
         while !thread.is_finished() && Instant::now() < deadline {
             thread::sleep(Duration::from_millis(5));
         }
         if thread.is_finished() {
-            // A panic of that thread was logged by the hook; it has no result that could be lost.
+            // The hook has logged any panic of that thread, and it has no result to lose.
             let _ = thread.join();
         }
     }
 }
 
-fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, disk: &Disk) {
+fn report(
+    progress: &Mutex<ProgressReport>,
+    ended: &AtomicBool,
+    receiver: &ReceiverState,
+    disk: &Disk,
+) {
     let started = Instant::now();
     let mut watchdog = Watchdog::new(started);
     let mut marks: VecDeque<(f64, u64, u64)> = VecDeque::new();
     loop {
         let last = ended.load(Ordering::Relaxed);
-        let mut line = progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let mut line = progress
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone();
         line.elapsed_secs += started.elapsed().as_secs_f64();
-        line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), reception.situation());
-        let faults = reception.faults();
+        line.stalled = watchdog.look(Instant::now(), &line, disk.waiting(), receiver.situation());
+        let faults = receiver.faults();
         line.reissued = faults.reissued_by_reason();
         line.refused = faults.refused_by_reason();
-        line.live_actors = reception.live_actors();
+        line.live_actors = receiver.live_actors();
         line.actors = line.live_actors.len();
         if marks.len() > RATE_INTERVALS {
             marks.pop_front();
@@ -101,7 +110,7 @@ fn report(progress: &Mutex<Progress>, ended: &AtomicBool, reception: &Shared, di
             line.updates_per_sec = (line.updates - updates) as f64 / secs;
         }
         if let Ok(json) = serde_json::to_string(&line) {
-            // Nobody may be listening; then nobody misses the line.
+            // Standard output may be closed; then the line is not missed.
             let _ = writeln!(std::io::stdout().lock(), "{json}");
         }
         if last {

@@ -1,33 +1,40 @@
-//! What a run has cost: time by what it was spent on, and what was lost on the way.
+//! Costs of a run: time by stage, and losses by reason.
 
 use std::collections::BTreeMap;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
-use skein_protocol::stages::Times;
+use skein_protocol::stages::StageTimes;
 
-use crate::flights::reception::Shared;
+use crate::faults::Faults;
 
-/// Time and losses, over all lives of the learner as far as checkpoints tell: what a death undid is not in it.
+/// Time and losses over all incarnations of the learner, as stored in checkpoints: work lost with a
+/// killed learner is not counted.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct Spent {
+pub struct RunCosts {
     /// Seconds from the learner's start to its end.
     pub wall_secs: f64,
     /// Time of the learner's threads and of the actors, by stage.
-    pub stages: Times,
+    pub stages: StageTimes,
     /// Tickets issued again, by reason.
     pub tickets_reissued: BTreeMap<String, u64>,
     /// Records refused, by reason.
     pub records_refused: BTreeMap<String, u64>,
 }
 
-impl Spent {
-    /// With what the present life, begun at `started`, has come to: `training` is its training thread's time, that of all others is in `shared`.
-    pub fn with_this_life(&self, started: Instant, training: &Times, shared: &Shared) -> Self {
-        let faults = shared.faults();
+impl RunCosts {
+    /// Adds the costs of the present incarnation, started at `started`. `training` is the time of
+    /// its training thread, `others` that of all other threads.
+    pub fn with_this_incarnation(
+        &self,
+        started: Instant,
+        training: &StageTimes,
+        others: &StageTimes,
+        faults: &Faults,
+    ) -> Self {
         Self {
             wall_secs: self.wall_secs + started.elapsed().as_secs_f64(),
-            stages: self.stages.plus(training).plus(&shared.times()),
+            stages: self.stages.plus(training).plus(others),
             tickets_reissued: sum(&self.tickets_reissued, faults.reissued_by_reason()),
             records_refused: sum(&self.records_refused, faults.refused_by_reason()),
         }

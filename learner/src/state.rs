@@ -1,29 +1,30 @@
-//! What a checkpoint must hold of the networks, as values with names.
+//! The networks' state in a checkpoint, as named tensors.
 //!
-//! Everything that an update changes is listed once, by [`Stateful::parts`]; storing and restoring both go through that list, so that nothing can be stored
-//! and not restored, or the other way round. What is stored says nothing of the engine that computed it.
+//! [`Stateful::parts`] lists everything that an update changes, once. Storing and restoring both
+//! use that list, so neither can miss what the other has. The stored state does not depend on the
+//! engine that computed it.
 
 use std::collections::HashMap;
 
 use tch::{Device, Kind, Tensor, no_grad_guard};
 
-/// A tensor on the processor, by name.
+/// A named tensor in main memory.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NamedTensor {
-    /// Its name, unique in a checkpoint.
+    /// Name, unique in a checkpoint.
     pub name: String,
-    /// Its shape, outermost first.
+    /// Shape, outermost dimension first.
     pub shape: Vec<usize>,
-    /// Its values in row-major order, as many as the shape says.
+    /// Values in row-major order, as many as the shape says.
     pub values: TensorValues,
 }
 
 /// A tensor's values.
 #[derive(Debug, Clone, PartialEq)]
 pub enum TensorValues {
-    /// Parameters, moments.
+    /// Parameters and moments.
     F32(Vec<f32>),
-    /// What must be exact in double precision.
+    /// Sums that must be exact in double precision.
     F64(Vec<f64>),
     /// Counters.
     I64(Vec<i64>),
@@ -47,10 +48,10 @@ impl TensorValues {
     }
 }
 
-/// Where a part of a state lies.
+/// Access to one part of a state.
 #[derive(Debug)]
-pub enum Part<'a> {
-    /// In the tensor library's memory, on whatever device: f32, f64 or i64. Shares its storage with the state.
+pub enum StatePart<'a> {
+    /// A libtorch tensor on any device: f32, f64 or i64. Shares its storage with the state.
     Tensor(Tensor),
     /// A flat vector, `[len]`.
     Numbers(&'a mut [f32]),
@@ -58,8 +59,8 @@ pub enum Part<'a> {
     Count(&'a mut u64),
 }
 
-impl Part<'_> {
-    /// A copy of the values, with their shape.
+impl StatePart<'_> {
+    /// Copies the shape and the values.
     fn read(&self) -> (Vec<usize>, TensorValues) {
         match self {
             Self::Tensor(tensor) => (shape(tensor), values(tensor)),
@@ -88,7 +89,7 @@ impl Part<'_> {
         }
     }
 
-    /// Takes over the values of a tensor of this kind and shape.
+    /// Replaces the values by those of a tensor of the same kind and shape.
     fn write(self, values: &TensorValues) {
         match (self, values) {
             (Self::Tensor(mut own), values) => {
@@ -107,7 +108,11 @@ impl Part<'_> {
 }
 
 fn shape(tensor: &Tensor) -> Vec<usize> {
-    tensor.size().into_iter().map(|size| size as usize).collect()
+    tensor
+        .size()
+        .into_iter()
+        .map(|size| size as usize)
+        .collect()
 }
 
 fn values(tensor: &Tensor) -> TensorValues {
@@ -127,37 +132,47 @@ fn values(tensor: &Tensor) -> TensorValues {
     }
 }
 
-/// Something whose whole state has names.
+/// An object whose whole state is a list of named parts.
 pub trait Stateful {
-    /// Every part of the state, under a name that is unique in the learner. To be changed in place: one list serves both ways.
-    fn parts(&mut self) -> Vec<(String, Part<'_>)>;
+    /// Lists every part of the state, under a name that is unique in the learner. The parts can be
+    /// changed in place: one list serves storing and restoring.
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)>;
 
-    /// A copy of the whole state.
+    /// Copies the whole state.
     fn named_tensors(&mut self) -> Vec<NamedTensor> {
         let parts = self.parts().into_iter();
         parts
             .map(|(name, part)| {
                 let (shape, values) = part.read();
-                NamedTensor { name, shape, values }
+                NamedTensor {
+                    name,
+                    shape,
+                    values,
+                }
             })
             .collect()
     }
 
-    /// Takes the state from `stored`, which may hold other tensors besides. The next update is then bit for bit the one that would have followed.
+    /// Restores the state from `stored`, which may hold other tensors too. The next update is then
+    /// bit for bit the one that would have followed.
     ///
     /// # Errors
-    /// [`RestoreError`] names the first tensor that does not fit; the state is untouched then.
-    fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), RestoreError> {
-        let stored: HashMap<&str, &NamedTensor> = stored.iter().map(|tensor| (tensor.name.as_str(), tensor)).collect();
+    /// [`TensorRestoreError`] names the first tensor that does not fit; the state is unchanged
+    /// then.
+    fn load_named(&mut self, stored: &[NamedTensor]) -> Result<(), TensorRestoreError> {
+        let stored: HashMap<&str, &NamedTensor> = stored
+            .iter()
+            .map(|tensor| (tensor.name.as_str(), tensor))
+            .collect();
         let mut pairs = Vec::new();
         for (name, own) in self.parts() {
             let NamedTensor { shape, values, .. } = *stored
                 .get(name.as_str())
-                .ok_or_else(|| RestoreError::Missing { name: name.clone() })?;
+                .ok_or_else(|| TensorRestoreError::Missing { name: name.clone() })?;
             let expected = own.shape();
             let len: usize = expected.iter().product();
             if (shape, values.kind(), values.len()) != (&expected, own.kind(), len) {
-                return Err(RestoreError::Shape {
+                return Err(TensorRestoreError::Shape {
                     name,
                     expected: format!("{} {expected:?}", own.kind()),
                     found: format!("{} {shape:?} with {} values", values.kind(), values.len()),
@@ -173,23 +188,26 @@ pub trait Stateful {
     }
 }
 
-/// Why a stored state cannot be taken over.
+/// Reason why a stored state cannot be restored.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RestoreError {
-    /// A tensor is not there.
-    #[error("the stored state lacks the tensor {name}: it comes from another version or is damaged")]
+pub enum TensorRestoreError {
+    /// A tensor is missing.
+    #[error(
+        "the stored state lacks the tensor {name}: it comes from another version or is damaged"
+    )]
     Missing {
-        /// Its name.
+        /// Name of the tensor.
         name: String,
     },
     /// A tensor has another shape or kind of number.
     #[error(
-        "the stored tensor {name} is {found}, not {expected}: it was stored under another configuration of the networks"
+        "the stored tensor {name} is {found}, not {expected}: \
+         it was stored under another configuration of the networks"
     )]
     Shape {
-        /// Its name.
+        /// Name of the tensor.
         name: String,
-        /// Kind and shape this configuration needs.
+        /// Kind and shape that this configuration needs.
         expected: String,
         /// Kind, shape and number of values found.
         found: String,
@@ -200,15 +218,15 @@ pub enum RestoreError {
 mod tests {
     use super::*;
 
-    /// A part of each sort.
+    /// A state with one part of each kind.
     struct Three(Tensor, Vec<f32>, u64);
 
     impl Stateful for Three {
-        fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+        fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
             vec![
-                ("first".into(), Part::Tensor(self.0.shallow_clone())),
-                ("second".into(), Part::Numbers(&mut self.1)),
-                ("third".into(), Part::Count(&mut self.2)),
+                ("first".into(), StatePart::Tensor(self.0.shallow_clone())),
+                ("second".into(), StatePart::Numbers(&mut self.1)),
+                ("third".into(), StatePart::Count(&mut self.2)),
             ]
         }
     }
@@ -219,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn a_state_is_taken_over_by_name() {
+    fn a_state_is_restored_by_name() {
         let mut stored = three([1.0, 2.0], 7).named_tensors();
         assert_eq!(
             stored[0],
@@ -246,7 +264,12 @@ mod tests {
         let mut state = three([0.0, 0.0], 0);
         let before = state.named_tensors();
         let missing = state.load_named(&stored[..2]).unwrap_err();
-        assert_eq!(missing, RestoreError::Missing { name: "third".into() });
+        assert_eq!(
+            missing,
+            TensorRestoreError::Missing {
+                name: "third".into()
+            }
+        );
         let misfits: [(usize, &[usize], TensorValues); 4] = [
             (0, &[1, 2], TensorValues::F32(vec![1.0; 2])),
             (1, &[1, 3], TensorValues::F32(vec![1.0; 3])),

@@ -1,82 +1,103 @@
-//! What is trained, and how much of it is due.
+//! The networks and the replay buffer, and how many updates are due.
 //!
-//! How many VAE steps and SAC updates an epoch brings follows from the steps flown so far alone, and every random draw is seeded by the version of the snapshot
-//! that the updates begin with, which no others do: a trainer restored from a checkpoint goes on bit for bit.
+//! The number of VAE steps and policy updates in an epoch follows from the steps flown so far
+//! alone. Every random draw is seeded by the version of the snapshot that its updates start from;
+//! no two series of updates start from the same one. So a trainer restored from a checkpoint
+//! continues bit for bit.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
-use skein_protocol::config::{Config, Engine};
+use skein_protocol::config::{AlgorithmName, Config, Engine};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::Exploration;
+use tch::Device;
 
-use crate::algorithm::{self, Algorithm, Columns};
-use crate::average::Average;
-use crate::checkpoint::Progress;
+use crate::algorithm::{Algorithm, Columns, Inputs};
+use crate::average::PolicyAverage;
+use crate::checkpoint::TrainingProgress;
 use crate::device::{self, DeviceError};
+use crate::episode::CommittedEpisode;
+use crate::episodes::assembly::KeptData;
 use crate::error::UpdateError;
-use crate::flight::CommittedFlight;
-use crate::flights::assembly::Keep;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::replay::{self, InsertError, Minibatch, Replay, ReplayState};
+use crate::sac::{NativeSac, TorchSac};
 use crate::state::{self, NamedTensor, Stateful};
+use crate::td3::Td3;
 use crate::vae::{Vae, VaeMetrics};
 
-/// Images encoded at once when stored codes are made anew.
+/// Images encoded at once when stored latent codes are computed again.
 const ENCODE_CHUNK: usize = 64;
 
-/// Why a stored state cannot be taken over.
+/// Reason why a stored state cannot be restored.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainerRestoreError {
-    /// Of the networks.
+    /// The networks' state does not fit.
     #[error(transparent)]
-    Networks(#[from] state::RestoreError),
-    /// Of the replay buffer.
+    Networks(#[from] state::TensorRestoreError),
+    /// The replay buffer's state does not fit.
     #[error(transparent)]
-    Replay(#[from] replay::RestoreError),
-    /// The tensors hold other counts than the counters.
+    Replay(#[from] replay::ReplayRestoreError),
+    /// The tensors contain another count than the counters.
     #[error("the stored {what} are {found}, but its counters say {expected}")]
     Count {
-        /// What is counted.
+        /// Name of the counter.
         what: &'static str,
-        /// In the tensors.
+        /// Count in the tensors.
         found: u64,
-        /// In the counters.
+        /// Count in the counters.
         expected: u64,
     },
 }
 
 /// Networks and replay buffer.
 #[derive(Debug)]
-pub struct Trainer {
+pub(crate) struct Trainer {
     config: Config,
     layout: SnapshotLayout,
     /// Threads of the native engine.
     team: Team,
-    /// Where it trains the encoder; else the algorithm does.
+    /// The VAE; `None` where the algorithm trains the encoder.
     vae: Option<Vae>,
-    /// What actors see through, as it was made after so many of the VAE's updates.
+    /// The actors' encoder, and the number of VAE updates it was made after.
     encoder: Option<(u64, Encoder)>,
     algorithm: Box<dyn Algorithm>,
-    /// What flies in the policy's place, if it is averaged.
-    average: Option<Average>,
+    /// Average of the policy that flies in its place, if averaging is configured.
+    average: Option<PolicyAverage>,
     replay: Replay,
     steps: u64,
-    /// Times that stored codes should have been made anew since the run began.
-    renewals: u64,
+    /// Number of times that stored latent codes were due for re-encoding since the run began.
+    recodings: u64,
+}
+
+/// Returns the algorithm that a configuration names, untrained. `device` is libtorch's; the native
+/// engine always runs on the CPU.
+pub(crate) fn new_algorithm(config: &Config, device: Device) -> Box<dyn Algorithm> {
+    let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
+    match (config.learning.algorithm, engine) {
+        (AlgorithmName::Sac, Engine::Native) => {
+            Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best()))
+        }
+        (AlgorithmName::Sac, Engine::Libtorch) => {
+            Box::new(TorchSac::new(&config.sac, inputs, seed, device))
+        }
+        (AlgorithmName::Td3, _) => Box::new(Td3::new(&config.td3, inputs, seed, device)),
+    }
 }
 
 impl Trainer {
-    /// Untrained networks and an empty buffer. Starts the native engine's threads, and sets the calling thread's tensor threads: training belongs on this thread.
+    /// Creates untrained networks and an empty buffer. Starts the native engine's threads and sets
+    /// the number of tensor threads of the calling thread, so training must stay on this thread.
     ///
     /// # Errors
     /// [`DeviceError`] when the configured device does not exist.
-    pub fn new(config: &Config) -> Result<Self, DeviceError> {
+    pub(crate) fn new(config: &Config) -> Result<Self, DeviceError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
         let engine = config.policy_engine();
@@ -88,13 +109,13 @@ impl Trainer {
             device = %config.run.device,
             %isa,
             threads,
-            "networks are computed"
+            "engines chosen"
         );
-        let algorithm = algorithm::new(config, device);
+        let algorithm = new_algorithm(config, device);
         let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),
-            average: (averaged > 0).then(|| Average::new(averaged, algorithm.as_ref())),
+            average: (averaged > 0).then(|| PolicyAverage::new(averaged, algorithm.as_ref())),
             team: Team::new(match engine {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
@@ -104,18 +125,18 @@ impl Trainer {
             algorithm,
             replay: Replay::new(config),
             steps: 0,
-            renewals: 0,
+            recodings: 0,
             config: config.clone(),
         })
     }
 
-    /// Takes over the state in a checkpoint: what follows is then bit for bit what would have followed.
+    /// Restores the state of a checkpoint; training then continues bit for bit.
     ///
     /// # Errors
-    /// [`TrainerRestoreError`] names what does not fit; the trainer is not to be used then.
-    pub fn restore(
+    /// [`TrainerRestoreError`] names what does not fit; do not use the trainer then.
+    pub(crate) fn restore(
         &mut self,
-        progress: &Progress,
+        progress: &TrainingProgress,
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
@@ -129,45 +150,49 @@ impl Trainer {
         }
         self.replay = Replay::restore(&self.config, replay)?;
         self.steps = progress.environment_steps;
-        self.renewals = self.renewals_due();
+        self.recodings = self.recodings_due();
         for (what, found, expected) in [
             ("VAE steps", self.vae_updates(), progress.vae_steps),
             ("policy updates", self.updates(), progress.policy_updates),
         ] {
             if found != expected {
-                return Err(TrainerRestoreError::Count { what, found, expected });
+                return Err(TrainerRestoreError::Count {
+                    what,
+                    found,
+                    expected,
+                });
             }
         }
         Ok(())
     }
 
-    /// Environment steps taken in.
-    pub fn steps(&self) -> u64 {
+    /// Environment steps learned from so far.
+    pub(crate) fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// Policy updates done.
-    pub fn updates(&self) -> u64 {
+    /// Policy updates done so far.
+    pub(crate) fn updates(&self) -> u64 {
         self.algorithm.updates()
     }
 
-    /// Updates of either network done.
-    pub fn all_updates(&self) -> u64 {
+    /// Policy updates and VAE steps done so far.
+    pub(crate) fn all_updates(&self) -> u64 {
         self.updates() + self.vae_updates()
     }
 
-    /// VAE steps done.
-    pub fn vae_updates(&self) -> u64 {
+    /// VAE steps done so far.
+    pub(crate) fn vae_updates(&self) -> u64 {
         self.vae.as_ref().map_or(0, Vae::updates)
     }
 
     /// The replay buffer.
-    pub fn replay(&self) -> &Replay {
+    pub(crate) fn replay(&self) -> &Replay {
         &self.replay
     }
 
-    /// How the next flights to be ordered choose their actions.
-    pub fn exploration(&self) -> Exploration {
+    /// Exploration of the next episodes to be ordered.
+    pub(crate) fn exploration(&self) -> Exploration {
         if self.steps < self.config.learning.warmup_steps as u64 {
             Exploration::Uniform
         } else {
@@ -175,32 +200,34 @@ impl Trainer {
         }
     }
 
-    /// What is needed of the next flights to be ordered.
-    pub fn keep(&self) -> Keep {
+    /// Data to keep of the next episodes to be ordered.
+    pub(crate) fn keep(&self) -> KeptData {
         match self.has_images() || self.config.learning.mirror {
-            true => Keep::Depth,
-            false => Keep::Latents,
+            true => KeptData::Depth,
+            false => KeptData::Latents,
         }
     }
 
-    /// Whether images are learned from: until the VAE is frozen, or to the end if there is none.
+    /// `true` while images are learned from: until the VAE is frozen, or to the end if there is
+    /// none.
     fn has_images(&self) -> bool {
         self.replay.image_count().is_some()
     }
 
-    /// Stores a flight's transitions, and if asked for those of its mirror image.
+    /// Stores an episode's transitions, and those of its mirror image if configured.
     ///
     /// # Errors
-    /// [`InsertError`] when its parts do not belong together.
-    pub fn take_in(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+    /// [`InsertError`] when the episode's parts do not fit together.
+    pub(crate) fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
-        let mirrored = learning.mirror.then(|| flight.mirrored());
-        // With policy lag, flights still come in that were flown with an encoder older than the frozen one: their codes are made anew. Without, images come for the mirror alone.
+        let mirrored = learning.mirror.then(|| episode.mirrored());
+        // With policy lag, some episodes arrive after the freeze that were flown with an older
+        // encoder: encode them again. Without lag, images come only for the mirror.
         if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
-            self.encode(&mut flight);
+            self.encode(&mut episode);
         }
-        self.steps += flight.steps() as u64;
-        self.insert(flight)?;
+        self.steps += episode.steps() as u64;
+        self.insert(episode)?;
         if let Some(mut mirrored) = mirrored {
             self.encode(&mut mirrored);
             self.insert(mirrored)?;
@@ -208,44 +235,50 @@ impl Trainer {
         Ok(())
     }
 
-    fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
+    fn insert(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         if !self.has_images() {
-            flight.depth = None;
+            episode.depth = None;
         }
-        self.replay.insert(flight)
+        self.replay.insert(episode)
     }
 
-    /// Makes a flight's codes anew with the encoder as it is, if there are images to make them from, and if it is learned from codes at all.
-    fn encode(&mut self, flight: &mut CommittedFlight) {
-        let (Some(depth), Some(_)) = (&flight.depth, &self.vae) else {
+    /// Encodes an episode's images with the present encoder. Does nothing without images or without
+    /// a VAE.
+    fn encode(&mut self, episode: &mut CommittedEpisode) {
+        let (Some(depth), Some(_)) = (&episode.depth, &self.vae) else {
             return;
         };
         let (encoder, team, _) = self.encoder();
         let codes = encoder.encode_all(team, depth);
-        for (observation, latent) in flight.observations.iter_mut().zip(codes) {
+        for (observation, latent) in episode.observations.iter_mut().zip(codes) {
             observation.latent = latent;
         }
     }
 
-    /// Trains the VAE as far as the steps flown ask for, from what snapshot `version` holds on, and freezes it when its time is over. `after_each` may do something
-    /// between steps, and give up; `timer` is told what the time went into.
+    /// Makes the VAE steps that are due by the steps flown, seeded by snapshot `version`; freezes
+    /// the VAE when its training ends. Calls `after_each` after every step and stops at its error.
+    /// Books the time in `timer`.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
-    pub fn train_vae<E: From<UpdateError>>(
+    /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
+    pub(crate) fn train_vae<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
         timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
-        let Some(vae) = self.vae.as_mut().filter(|_| self.replay.image_count().is_some()) else {
+        let Some(vae) = self
+            .vae
+            .as_mut()
+            .filter(|_| self.replay.image_count().is_some())
+        else {
             return Ok(None);
         };
         let section = &self.config.vae;
         let counted = self.steps.min(section.train_steps as u64);
         let due = (counted as f64 * section.updates_per_step) as u64;
-        let mut rng = rng(&self.config, Purpose::VaeBatches, version);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::VaeNoise, version.0));
+        let purposes = (Purpose::VaeBatches, Purpose::VaeNoise);
+        let (mut rng, mut noise) = draws(&self.config, purposes, version);
         let (mut images, mut last) = (Vec::new(), None);
         while vae.updates() < due {
             self.replay
@@ -256,70 +289,81 @@ impl Trainer {
             after_each(&metrics)?;
             last = Some(metrics);
         }
-        let due = self.renewals_due();
+        let due = self.recodings_due();
         let is_over = self.steps >= self.config.vae.train_steps as u64;
-        if is_over || self.renewals < due {
-            self.renew_latents();
+        if is_over || self.recodings < due {
+            self.recode_latents();
             timer.lap(Stage::Recode, 1);
         }
-        self.renewals = due;
+        self.recodings = due;
         if is_over {
-            tracing::info!(steps = self.steps, vae_updates = self.vae_updates(), "VAE frozen");
+            tracing::info!(
+                steps = self.steps,
+                vae_updates = self.vae_updates(),
+                "VAE frozen"
+            );
             self.replay.freeze();
         }
         Ok(last)
     }
 
-    fn renewals_due(&self) -> u64 {
-        self.steps.checked_div(self.config.vae.recode_steps as u64).unwrap_or(0)
+    fn recodings_due(&self) -> u64 {
+        self.steps
+            .checked_div(self.config.vae.recode_steps as u64)
+            .unwrap_or(0)
     }
 
-    /// Makes stored codes anew with the encoder as it is.
-    fn renew_latents(&mut self) {
+    /// Encodes all stored images again with the present encoder.
+    fn recode_latents(&mut self) {
         let (encoder, team, replay) = self.encoder();
         let renewed: Result<(), std::convert::Infallible> =
-            replay.renew_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
+            replay.recode_latents(ENCODE_CHUNK, |images| Ok(encoder.encode_all(team, images)));
         let Ok(()) = renewed;
     }
 
-    /// The encoder as actors have it, so that codes made here are those that actors send, to the last bit; and what it works with.
+    /// Returns the encoder as actors have it, so that codes computed here equal theirs to the last
+    /// bit. Also returns the team and the replay, which its callers need beside it.
     fn encoder(&mut self) -> (&Encoder, &mut Team, &mut Replay) {
         let updates = self.vae_updates();
-        let made = self.encoder.take().filter(|(made_after, _)| *made_after == updates);
+        let made = self
+            .encoder
+            .take()
+            .filter(|(made_after, _)| *made_after == updates);
         let make = || {
             let snapshot = self.snapshot(PolicyVersion(0));
-            (
-                updates,
-                encoder(&snapshot, &self.layout, self.config.vae.encoder_precision),
-            )
+            (updates, encoder(&snapshot, &self.layout))
         };
         let made = made.unwrap_or_else(make);
         let (_, encoder) = self.encoder.insert(made);
         (encoder, &mut self.team, &mut self.replay)
     }
 
-    /// Does the policy updates that the steps flown since the warm-up ask for, from what snapshot `version` holds on; their metrics go into `means`. `after_each`
-    /// may do something between updates, and give up; `timer` is told what the time went into.
+    /// Makes the policy updates that are due by the steps flown since the warm-up, seeded by
+    /// snapshot `version`. Adds their metrics to `means`. Calls `after_each` after every update and
+    /// stops at its error. Books the time in `timer`.
     ///
     /// # Errors
-    /// [`UpdateError`] when a number is no longer finite; what `after_each` returns.
-    pub fn train_policy<E: From<UpdateError>>(
+    /// [`UpdateError`] when a number is no longer finite; any error of `after_each`.
+    pub(crate) fn train_policy<E: From<UpdateError>>(
         &mut self,
         version: PolicyVersion,
         timer: &mut LapTimer,
-        means: &mut Means,
+        means: &mut MetricMeans,
         mut after_each: impl FnMut(&[(Scalar, f32)]) -> Result<(), E>,
     ) -> Result<(), E> {
         let learning = &self.config.learning;
         let counted = self.steps.saturating_sub(learning.warmup_steps as u64);
         let due = (counted as f64 * learning.updates_per_step) as u64;
-        let mut rng = rng(&self.config, Purpose::PolicyBatches, version);
-        let mut noise = Noise::new(derive(self.config.run.seed, Purpose::PolicyNoise, version.0));
+        let purposes = (Purpose::PolicyBatches, Purpose::PolicyNoise);
+        let (mut rng, mut noise) = draws(&self.config, purposes, version);
         let mut minibatch = Minibatch::default();
         while self.algorithm.updates() < due {
-            self.replay.sample(&mut rng, self.config.batch_size(), &mut minibatch);
+            self.replay
+                .sample(&mut rng, self.config.batch_size(), &mut minibatch);
             timer.lap(Stage::Sample, 1);
-            let metrics = self.algorithm.update(&mut self.team, columns(&minibatch), &mut noise)?;
+            let metrics = self
+                .algorithm
+                .update(&mut self.team, columns(&minibatch), &mut noise)?;
             if let Some(average) = &mut self.average {
                 average.take_in(self.algorithm.as_ref());
             }
@@ -330,8 +374,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// The parameters that actors fly with, as they are now.
-    pub fn snapshot(&self, version: PolicyVersion) -> Snapshot {
+    /// Returns the parameters that actors fly with, as they are now.
+    pub(crate) fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
         let encoder = &mut values[self.layout.encoder()];
         match &self.vae {
@@ -346,23 +390,46 @@ impl Trainer {
         Snapshot { version, values }
     }
 
-    /// `images` as the VAE sees them, if there is one: `[n, 72, 128]` u8, both ways.
-    pub fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
+    /// Returns the VAE's reconstruction of `images`, both `[n, 72, 128]` u8; `None` without a VAE.
+    pub(crate) fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
         let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
-        Some(depth.map(|depth| (depth * 255.0).round_ties_even() as u8).collect())
+        Some(
+            depth
+                .map(|depth| (depth * 255.0).round_ties_even() as u8)
+                .collect(),
+        )
     }
 
-    /// Copies of all tensors that updates change.
-    pub fn tensors(&mut self) -> Vec<NamedTensor> {
-        let mut all = self.vae.as_mut().map(Vae::named_tensors).unwrap_or_default();
+    /// Copies all tensors that updates change.
+    pub(crate) fn tensors(&mut self) -> Vec<NamedTensor> {
+        let mut all = self
+            .vae
+            .as_mut()
+            .map(Vae::named_tensors)
+            .unwrap_or_default();
         all.extend(self.algorithm.named_tensors());
-        all.extend(self.average.as_mut().map(Average::named_tensors).unwrap_or_default());
+        all.extend(
+            self.average
+                .as_mut()
+                .map(PolicyAverage::named_tensors)
+                .unwrap_or_default(),
+        );
         all
     }
 }
 
-fn rng(config: &Config, purpose: Purpose, version: PolicyVersion) -> Pcg64Mcg {
-    Pcg64Mcg::seed_from_u64(derive(config.run.seed, purpose, version.0))
+/// Returns what the updates that start from snapshot `version` draw their minibatches and their
+/// noise with.
+fn draws(
+    config: &Config,
+    (batches, noise): (Purpose, Purpose),
+    version: PolicyVersion,
+) -> (Pcg64Mcg, Noise) {
+    let seed = |purpose| derive(config.run.seed, purpose, version.0);
+    (
+        Pcg64Mcg::seed_from_u64(seed(batches)),
+        Noise::new(seed(noise)),
+    )
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {
@@ -378,18 +445,19 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         rewards: &minibatch.rewards,
         next_observations: &minibatch.next_observations,
         terminated: &minibatch.terminated,
-        images: (!minibatch.images.is_empty()).then_some([&minibatch.images, &minibatch.next_images]),
+        images: (!minibatch.images.is_empty())
+            .then_some([&minibatch.images, &minibatch.next_images]),
     }
 }
 
-/// Means of the metrics of an epoch's updates.
+/// MetricMeans of the metrics of an epoch's updates.
 #[derive(Debug, Default)]
-pub struct Means {
+pub(crate) struct MetricMeans {
     sums: Vec<(Scalar, f64)>,
     count: usize,
 }
 
-impl Means {
+impl MetricMeans {
     fn add(&mut self, metrics: &[(Scalar, f32)]) {
         if self.sums.is_empty() {
             self.sums = metrics.iter().map(|(scalar, _)| (*scalar, 0.0)).collect();
@@ -400,8 +468,8 @@ impl Means {
         self.count += 1;
     }
 
-    /// The means; nothing if there was no update.
-    pub fn finish(self) -> Vec<(Scalar, f64)> {
+    /// Returns the means; empty if there was no update.
+    pub(crate) fn finish(self) -> Vec<(Scalar, f64)> {
         let mean = |(scalar, sum)| (scalar, sum / self.count as f64);
         self.sums.into_iter().map(mean).collect()
     }

@@ -1,14 +1,20 @@
 //! The training loop: delayed learning, in reading order.
 //!
-//! An epoch is a fixed number of flights, all flown with one frozen snapshot. When the last of them is committed, the learner takes them in, in flight
-//! order, updates the networks and publishes the next snapshot. With direct updates an epoch is one flight, flown in legs, and the same is done after each of
-//! them. Everything it does follows from configuration, seed and committed flights; a learner that died goes on from a checkpoint as if nothing had been (`saving`).
+//! An epoch is a fixed number of episodes, all flown with one frozen snapshot. When the last of
+//! them is committed, the learner takes them in, in episode order, updates the networks and
+//! publishes the next snapshot. With direct updates, an epoch is one episode, flown in segments,
+//! and the same happens after each segment.
+//!
+//! Everything follows from configuration, seed and committed episodes. A learner that was killed
+//! resumes from a checkpoint with identical results (`saving`).
 
 mod candidates;
 mod curves;
 mod error;
 mod saving;
 mod stop;
+#[cfg(test)]
+mod tests;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -16,87 +22,97 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
 use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
-use skein_protocol::progress::Phase;
-use skein_protocol::run::{Life, RunDirectory, RunIdentity};
+use skein_protocol::progress::LearnerPhase;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::{RunEnding, Summary};
+use skein_run::fault::{FaultPoint, die_if_armed};
+use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity};
 
-use crate::checkpoint::{CheckpointWriter, EpochOrder, Progress};
+use crate::checkpoint::{CheckpointWriter, EpochOrder, TrainingProgress};
 use crate::curriculum;
 use crate::disk::Disk;
-use crate::flight::CommittedFlight;
-use crate::flights::reception::{Batch, Reception, ReceptionError};
+use crate::episode::CommittedEpisode;
+use crate::episodes::ReceiverError;
+use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
 
 use curves::EpochCurves;
 pub use error::TrainingError;
-use stop::StopWatch;
+use stop::StopMonitor;
 
-/// A run under way.
+/// A run in progress.
 struct Training<'a> {
     config: &'a Config,
     identity: &'a RunIdentity,
     directory: &'a RunDirectory,
     stop: &'a AtomicBool,
-    stop_watch: StopWatch<'a>,
+    stop_monitor: StopMonitor<'a>,
     disk: Disk,
     layout: SnapshotLayout,
     trainer: Trainer,
-    reception: Reception,
+    receiver: EpisodeReceiver,
     reporter: Reporter,
     metrics: Metrics,
     checkpoints: CheckpointWriter,
     started: Instant,
     epoch_started: Instant,
     curves: EpochCurves,
-    /// What this thread's time goes into: what it does between two laps is in the later one.
+    /// Time of this thread by stage. Work between two laps counts to the later one.
     timer: LapTimer,
-    /// What is counted of the run. What trainer and metrics count themselves is filled in for a checkpoint.
-    progress: Progress,
-    /// The newest checkpoint's.
-    saved: Progress,
-    /// Times the learner was started before.
+    /// Counters of the run. Those that trainer and metrics keep themselves are filled in for a
+    /// checkpoint.
+    progress: TrainingProgress,
+    /// Progress in the newest checkpoint.
+    saved: TrainingProgress,
+    /// Snapshots in the newest checkpoint.
+    saved_snapshots: BTreeMap<PolicyVersion, Snapshot>,
+    /// Number of earlier incarnations of the learner.
     resumes: u64,
-    /// Ordered and not learned from.
-    in_the_air: VecDeque<InTheAir>,
-    /// The flight whose first legs are learned from, and whose next leg is not, as far as it was flown; without images.
-    under_way: Option<CommittedFlight>,
-    /// The newest snapshot, those of the flights in the air, and the best.
+    /// Epochs or segments that are ordered but not learned from.
+    in_flight: VecDeque<OrderInFlight>,
+    /// Episode of which some segments are learned from and others are not flown yet, without
+    /// images.
+    open_episode: Option<CommittedEpisode>,
+    /// The newest snapshot, those of the orders in flight, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,
 }
 
-/// Flights of an epoch that are under way, or the leg of one.
-struct InTheAir {
+/// One order in flight: the episodes of an epoch, or a segment of one.
+struct OrderInFlight {
     order: EpochOrder,
-    batch: Batch,
-    /// Those that have come in.
-    flights: Vec<CommittedFlight>,
+    batch: EpisodeBatch,
+    /// Episodes that have arrived.
+    episodes: Vec<CommittedEpisode>,
 }
 
-/// Trains the run in `directory` to its end, in this `life` of its learner, or until `stop` is set; writes and returns what it came to. It goes on from
-/// the newest undamaged checkpoint, if there is one.
+/// Trains the run in `directory` to its end or until `stop` is set, in this `incarnation` of its
+/// learner. Resumes from the newest undamaged checkpoint, if there is one. Writes and returns the
+/// summary.
 ///
 /// # Errors
-/// [`TrainingError`]; what was learned until the last checkpoint is on disk.
+/// [`TrainingError`]; the last checkpoint stays on disk.
 pub fn run(
     directory: &RunDirectory,
     identity: &RunIdentity,
-    life: Life,
+    incarnation: LearnerIncarnation,
     config: &Config,
     stop: &Arc<AtomicBool>,
 ) -> Result<Summary, TrainingError> {
-    let mut training = Training::begin(directory, identity, life, config, stop)?;
+    let mut training = Training::begin(directory, identity, incarnation, config, stop)?;
     let end = match training.train() {
-        Ok(()) => training.save().map(|progress| (Ending::Completed, progress)),
-        Err(TrainingError::Reception(ReceptionError::Stopped)) => {
-            training.save().map(|progress| (Ending::Interrupted, progress))
-        }
-        Err(TrainingError::Abandoned) => training.go_back().map(|progress| (Ending::Interrupted, progress)),
+        Ok(()) => training
+            .save()
+            .map(|progress| (RunEnding::Completed, progress)),
+        Err(TrainingError::EpisodeReceiver(ReceiverError::Stopped)) => training
+            .save()
+            .map(|progress| (RunEnding::Interrupted, progress)),
+        Err(TrainingError::Abandoned) => training
+            .roll_back()
+            .map(|progress| (RunEnding::Interrupted, progress)),
         Err(error) => Err(error),
     };
     training.conclude(end)
@@ -105,73 +121,90 @@ pub fn run(
 impl Training<'_> {
     fn train(&mut self) -> Result<(), TrainingError> {
         self.learn()?;
-        // Whoever dies in the final evaluation has lost the evaluation alone.
+        // If the learner is killed in the final evaluation, only the evaluation is lost.
         self.checkpoint()?;
         self.evaluate_best()
     }
 
-    /// All epochs, those that an earlier life has learned from apart.
+    /// Learns from all epochs that earlier incarnations have not learned from.
     fn learn(&mut self) -> Result<(), TrainingError> {
         let epochs = curriculum::epochs(self.config);
-        // An earlier life may have been stopped while it looked.
-        self.look_for_best()?;
+        // An earlier incarnation may have been stopped during a confirmation.
+        self.confirm_if_candidate()?;
         while self.progress.epochs < epochs {
             let epoch = self.progress.epochs;
-            // With policy lag 1, the next epoch is flown with the snapshot at hand while this one is learned from.
-            self.order_until(epochs.min(epoch + 1 + self.config.learning.policy_lag))?;
+            self.order_ahead()?;
             self.learn_from_flown()?;
-            while self.under_way.is_some() {
-                // The rest of the flight is flown with what its last leg has taught.
+            while self.open_episode.is_some() {
+                // The rest of the episode is flown with what its last segment taught.
                 self.order(self.next_order(epoch))?;
                 self.learn_from_flown()?;
             }
             self.progress.epochs += 1;
-            tracing::debug!(epoch, flights = self.progress.flights, "epoch learned from");
-            self.draw_curves()?;
-            self.look_for_best()?;
+            tracing::debug!(
+                epoch,
+                episodes = self.progress.episodes,
+                "epoch learned from"
+            );
+            self.write_curves()?;
+            self.confirm_if_candidate()?;
             self.checkpoint_if_due()?;
         }
         Ok(())
     }
 
-    /// Waits for the flights or the leg ordered first, learns from them, and publishes what was learned.
+    /// Waits for the oldest order, learns from it, and publishes the result.
     fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
         let flown = self.collect()?;
         self.take_in(flown)?;
         let before = self.trainer.all_updates();
         self.train_vae()?;
         self.train_policy()?;
-        // A leg that brings no update goes on with the snapshot there is.
-        if self.under_way.is_none() || self.trainer.all_updates() > before {
-            self.progress.version += 1;
-            self.publish()?;
-        }
-        Ok(())
+        self.publish_if_due(self.trainer.all_updates() > before)
     }
 
-    /// Publishes the parameters as they are now.
+    /// Publishes the next version. After a segment without updates, the present snapshot stays in
+    /// use.
+    fn publish_if_due(&mut self, is_updated: bool) -> Result<(), TrainingError> {
+        if self.open_episode.is_some() && !is_updated {
+            return Ok(());
+        }
+        self.progress.version += 1;
+        self.publish()
+    }
+
+    /// Publishes the present parameters.
     fn publish(&mut self) -> Result<(), TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let snapshot = self.trainer.snapshot(self.progress.version());
-        self.reception.publish(snapshot.clone())?;
+        self.receiver.publish(snapshot.clone())?;
         self.snapshots.insert(snapshot.version, snapshot);
         self.forget_snapshots();
         self.timer.lap(Stage::Publish, 1);
         Ok(())
     }
 
-    /// Forgets snapshots that nobody will fly any more.
+    /// Drops snapshots that no later episode needs.
     fn forget_snapshots(&mut self) {
         let mut needed = vec![self.progress.version().0];
-        needed.extend(self.in_the_air.iter().map(|epoch| epoch.order.policy_version));
+        needed.extend(
+            self.in_flight
+                .iter()
+                .map(|epoch| epoch.order.policy_version),
+        );
         needed.extend(self.progress.best.as_ref().map(|best| best.policy_version));
-        self.snapshots.retain(|version, _| needed.contains(&version.0));
+        self.snapshots
+            .retain(|version, _| needed.contains(&version.0));
     }
 
-    /// Orders the flights of all epochs before `end` that are not ordered yet, to be flown with the newest snapshot.
-    fn order_until(&mut self, end: u64) -> Result<(), TrainingError> {
+    /// Orders the next epoch's episodes, if they are not ordered yet, with the newest snapshot.
+    /// With policy lag 1, also those of the epoch after it: they are flown with the present
+    /// snapshot while the next epoch is learned from.
+    fn order_ahead(&mut self) -> Result<(), TrainingError> {
+        let end = self.progress.epochs + 1 + self.config.learning.policy_lag;
+        let end = end.min(curriculum::epochs(self.config));
         let first = self
-            .in_the_air
+            .in_flight
             .back()
             .map_or(self.progress.epochs, |last| last.order.epoch + 1);
         for epoch in first..end {
@@ -180,7 +213,7 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// How what is ordered now of `epoch` is flown.
+    /// Returns an order for `epoch` with the present snapshot.
     fn next_order(&self, epoch: u64) -> EpochOrder {
         EpochOrder {
             epoch,
@@ -190,9 +223,12 @@ impl Training<'_> {
         }
     }
 
-    /// Orders the flights of an epoch, or the next leg of the one that is under way.
+    /// Orders the episodes of an epoch, or the next segment of the open episode.
     fn order(&mut self, order: EpochOrder) -> Result<(), TrainingError> {
-        let flown = self.under_way.as_ref().map_or(&[][..], |flight| &flight.actions);
+        let flown = self
+            .open_episode
+            .as_ref()
+            .map_or(&[][..], |episode| &episode.actions);
         let tickets = curriculum::training(
             self.config,
             self.identity.run,
@@ -201,51 +237,60 @@ impl Training<'_> {
             order.exploration,
             flown,
         );
-        let batch = self.reception.fly(Epoch(order.epoch), order.keep, tickets)?;
-        let flights = Vec::with_capacity(batch.remaining());
-        self.in_the_air.push_back(InTheAir { order, batch, flights });
+        let batch = self.receiver.fly(Epoch(order.epoch), order.keep, tickets)?;
+        let episodes = Vec::with_capacity(batch.remaining());
+        self.in_flight.push_back(OrderInFlight {
+            order,
+            batch,
+            episodes,
+        });
         Ok(())
     }
 
-    /// Waits for all flights of the epoch that was ordered first, or for its leg. Until they are there, it counts as in the air.
-    fn collect(&mut self) -> Result<Vec<CommittedFlight>, TrainingError> {
+    /// Waits for all episodes of the oldest order, or for its segment. Until they are complete, the
+    /// order stays in flight.
+    fn collect(&mut self) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
-        self.reporter.update(|progress| progress.phase = Phase::Flying);
-        let (is_amid_flight, shared) = (self.under_way.is_some(), self.reception.shared());
-        if let Some(InTheAir { batch, flights, .. }) = self.in_the_air.front_mut() {
-            let watch = &mut self.stop_watch;
-            let mut next = || match is_amid_flight {
-                true => batch.next_unless(|| watch.amid_flight(&shared)),
+        self.reporter
+            .update(|progress| progress.phase = LearnerPhase::Flying);
+        let (is_mid_episode, state) = (self.open_episode.is_some(), self.receiver.state());
+        if let Some(OrderInFlight {
+            batch, episodes, ..
+        }) = self.in_flight.front_mut()
+        {
+            let watch = &mut self.stop_monitor;
+            let mut next = || match is_mid_episode {
+                true => batch.next_unless(|| watch.during_episode(&state)),
                 false => Ok(batch.next(self.stop)?),
             };
-            while let Some(flight) = next()? {
+            while let Some(episode) = next()? {
                 self.reporter.update(|progress| {
-                    progress.flights += u64::from(flight.outcome.is_some());
-                    progress.steps += flight.steps() as u64;
+                    progress.episodes += u64::from(episode.outcome.is_some());
+                    progress.steps += episode.steps() as u64;
                 });
-                flights.push(flight);
+                episodes.push(episode);
             }
         }
         self.timer.lap(Stage::TrainingIdle, 1);
-        pass(FaultPoint::LearnerEpochCollected);
+        die_if_armed(FaultPoint::LearnerEpochCollected);
         Ok(self
-            .in_the_air
+            .in_flight
             .pop_front()
-            .map(|epoch| epoch.flights)
+            .map(|epoch| epoch.episodes)
             .unwrap_or_default())
     }
 
-    /// Takes what was flown into metrics and replay buffer, in flight order.
-    fn take_in(&mut self, flown: Vec<CommittedFlight>) -> Result<(), TrainingError> {
+    /// Adds what was flown to metrics and replay buffer, in episode order.
+    fn take_in(&mut self, flown: Vec<CommittedEpisode>) -> Result<(), TrainingError> {
         let count = flown.len() as u64;
-        for flight in flown {
-            self.curves.steps += flight.steps();
-            self.tell(&flight)?;
-            self.trainer.take_in(flight)?;
+        for episode in flown {
+            self.curves.steps += episode.steps();
+            self.record(&episode)?;
+            self.trainer.take_in(episode)?;
         }
         let windows = self.metrics.windows();
         self.reporter.update(|progress| {
-            progress.phase = Phase::Learning;
+            progress.phase = LearnerPhase::Learning;
             progress.walls_passed = windows.walls_passed.mean();
             progress.mean_return = windows.total_reward.mean();
         });
@@ -253,47 +298,49 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Tells the metrics of a flight that has ended, and keeps one that goes on.
-    fn tell(&mut self, flown: &CommittedFlight) -> Result<(), TrainingError> {
-        let joined = self.under_way.take().map(|mut flight| {
-            flight.extend(flown);
-            flight
+    /// Records an episode that has ended in the metrics, and keeps one that continues.
+    fn record(&mut self, flown: &CommittedEpisode) -> Result<(), TrainingError> {
+        let joined = self.open_episode.take().map(|mut episode| {
+            episode.extend(flown);
+            episode
         });
         if flown.outcome.is_none() {
-            self.under_way = joined.or_else(|| Some(flown.without_images()));
+            self.open_episode = joined.or_else(|| Some(flown.without_images()));
             return Ok(());
         }
-        self.metrics.flight(joined.as_ref().unwrap_or(flown))?;
-        self.progress.flights += 1;
+        self.metrics.episode(joined.as_ref().unwrap_or(flown))?;
+        self.progress.episodes += 1;
         Ok(())
     }
 
-    /// Tells what the epoch that has just been learned from brought.
-    fn draw_curves(&mut self) -> Result<(), TrainingError> {
+    /// Writes the curves' points of the epoch just learned from.
+    fn write_curves(&mut self) -> Result<(), TrainingError> {
         let curves = std::mem::take(&mut self.curves);
-        let shared = self.reception.shared();
-        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &shared);
+        let faults = self.receiver.state().faults();
+        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &faults);
         self.epoch_started = Instant::now();
-        self.metrics.scalars(self.last_flight(), &points)?;
+        self.metrics.scalars(self.last_episode(), &points)?;
         Ok(self.metrics.flush()?)
     }
 
-    /// The number of the newest flight: what curves are keyed by.
-    fn last_flight(&self) -> u64 {
-        self.progress.flights.saturating_sub(1)
+    /// Number of the newest episode, the curves' x-axis.
+    fn last_episode(&self) -> u64 {
+        self.progress.episodes.saturating_sub(1)
     }
 
     fn train_vae(&mut self) -> Result<(), TrainingError> {
         let version = self.progress.version();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
-        let trained = self.trainer.train_vae(version, &mut self.timer, |metrics| {
-            reporter.update(|progress| {
-                progress.vae_updates += 1;
-                progress.vae_loss = Some(metrics.loss.into());
-            });
-            pass(FaultPoint::LearnerMidUpdates);
-            watch.after_update()
-        })?;
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
+        let trained = self
+            .trainer
+            .train_vae(version, &mut self.timer, |metrics| {
+                reporter.update(|progress| {
+                    progress.vae_updates += 1;
+                    progress.vae_loss = Some(metrics.loss.into());
+                });
+                die_if_armed(FaultPoint::LearnerMidUpdates);
+                watch.after_update()
+            })?;
         self.curves.vae = trained.or(self.curves.vae);
         Ok(())
     }
@@ -302,19 +349,22 @@ impl Training<'_> {
         self.timer.lap(Stage::OtherTraining, 0);
         let version = self.progress.version();
         let started = Instant::now();
-        let (reporter, watch) = (&self.reporter, &mut self.stop_watch);
+        let (reporter, watch) = (&self.reporter, &mut self.stop_monitor);
         let updates_before = self.trainer.updates();
         let means = &mut self.curves.policy;
-        self.trainer.train_policy(version, &mut self.timer, means, |metrics| {
-            let temperature = metrics.iter().find(|(scalar, _)| *scalar == Scalar::Temperature);
-            reporter.update(|progress| {
-                progress.updates += 1;
-                progress.temperature = temperature.map(|(_, value)| f64::from(*value));
-            });
-            pass(FaultPoint::LearnerMidUpdates);
-            watch.after_update()
-        })?;
-        pass(FaultPoint::LearnerUpdated);
+        self.trainer
+            .train_policy(version, &mut self.timer, means, |metrics| {
+                let temperature = metrics
+                    .iter()
+                    .find(|(scalar, _)| *scalar == Scalar::Temperature);
+                reporter.update(|progress| {
+                    progress.updates += 1;
+                    progress.temperature = temperature.map(|(_, value)| f64::from(*value));
+                });
+                die_if_armed(FaultPoint::LearnerMidUpdates);
+                watch.after_update()
+            })?;
+        die_if_armed(FaultPoint::LearnerUpdated);
         self.curves.updates += self.trainer.updates() - updates_before;
         self.curves.updating += started.elapsed();
         Ok(())

@@ -1,103 +1,114 @@
-//! Notices that nothing moves, and says who waits for whom.
+//! Notices a stall and reports which thread or actor is waited for.
 
 use std::time::{Duration, Instant};
 
-use skein_protocol::progress::{Phase, Progress};
+use skein_protocol::progress::{LearnerPhase, ProgressReport};
 
-use crate::flights::situation::Situation;
+use crate::episodes::situation::Situation;
 
-/// Time without any progress after which it is told why.
+/// Time without progress after which the reason is reported.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Time between two warnings about one stall.
 const WARN_INTERVAL: Duration = Duration::from_secs(60);
-/// Time without a heartbeat of the receiving thread after which it is the one that is waited for.
-const RECEPTION_PATIENCE: Duration = Duration::from_secs(20);
+/// Age of the receiving thread's heartbeat after which that thread counts as stuck.
+const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 
-/// Looks at each report.
+/// Examines every progress report.
 #[derive(Debug)]
-pub struct Watchdog {
-    done: Option<Done>,
-    /// When that was first seen.
+pub(crate) struct Watchdog {
+    done: Option<WorkDone>,
+    /// Time at which this state was first seen.
     since: Instant,
-    /// When the present stall was last told.
-    told: Option<Instant>,
+    /// Time of the last warning about the present stall.
+    warned: Option<Instant>,
 }
 
-/// Everything that moves in a run that gets on.
+/// All counters that a healthy run advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Done {
-    phase: Phase,
-    flights: u64,
+struct WorkDone {
+    phase: LearnerPhase,
+    episodes: u64,
     steps: u64,
     updates: u64,
     vae_updates: u64,
-    evaluation_flights: (u64, u64),
+    evaluation_episodes: (u64, u64),
 }
 
 impl Watchdog {
-    /// One that has seen nothing yet, at `now`.
-    pub fn new(now: Instant) -> Self {
+    /// Starts at `now`, with nothing seen yet.
+    pub(crate) fn new(now: Instant) -> Self {
         Self {
             done: None,
             since: now,
-            told: None,
+            warned: None,
         }
     }
 
-    /// Who waits for whom, if nothing has moved for a while. `obstacle`: what is known to stop the training thread. `reception`: how long ago the
-    /// receiving thread last told where the flights are, and what it told.
-    pub fn look(
+    /// Returns what is waited for, if nothing has moved for a while. `obstacle`: a known obstacle
+    /// to the training thread. `receiver`: age and content of the receiving thread's last
+    /// heartbeat.
+    pub(crate) fn look(
         &mut self,
         now: Instant,
-        progress: &Progress,
+        progress: &ProgressReport,
         obstacle: Option<String>,
-        reception: Option<(Duration, Situation)>,
+        receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
-        let done = Done {
+        let done = WorkDone {
             phase: progress.phase,
-            flights: progress.flights,
+            episodes: progress.episodes,
             steps: progress.steps,
             updates: progress.updates,
             vae_updates: progress.vae_updates,
-            evaluation_flights: progress.evaluation_flights,
+            evaluation_episodes: progress.evaluation_episodes,
         };
         if self.done != Some(done) {
             self.done = Some(done);
             self.since = now;
-            self.told = None;
+            self.warned = None;
         }
         let still = now.saturating_duration_since(self.since);
         // A full disk is known at once, and nothing moves until there is room.
         if still < PATIENCE && obstacle.is_none() {
             return None;
         }
-        let waits = obstacle.unwrap_or_else(|| who_waits(progress.phase, still, reception));
+        let waits = obstacle.unwrap_or_else(|| who_waits(progress.phase, still, receiver));
         if still >= PATIENCE
             && self
-                .told
-                .is_none_or(|told| now.saturating_duration_since(told) >= WARN_INTERVAL)
+                .warned
+                .is_none_or(|warned| now.saturating_duration_since(warned) >= WARN_INTERVAL)
         {
-            self.told = Some(now);
+            self.warned = Some(now);
             tracing::warn!(still_secs = still.as_secs(), waits, "nothing moves");
         }
         Some(waits)
     }
 }
 
-fn who_waits(phase: Phase, still: Duration, reception: Option<(Duration, Situation)>) -> String {
+fn who_waits(
+    phase: LearnerPhase,
+    still: Duration,
+    receiver: Option<(Duration, Situation)>,
+) -> String {
     let still = still.as_secs();
-    let flights = match phase {
-        Phase::Flying => "flights",
-        Phase::Evaluating => "evaluation flights",
-        Phase::Learning => return format!("the training thread has been at one step of its updates for {still} s"),
-        Phase::Finishing => return format!("the training thread has been writing what remains for {still} s"),
+    let episodes = match phase {
+        LearnerPhase::Flying => "episodes",
+        LearnerPhase::Evaluating => "evaluation episodes",
+        LearnerPhase::Learning => {
+            return format!(
+                "the training thread has been at one step of its updates for {still} s"
+            );
+        }
+        LearnerPhase::Finishing => {
+            return format!("the training thread has been writing the last files for {still} s");
+        }
     };
-    let waits = format!("the training thread has waited for {flights} for {still} s");
-    match reception {
-        None => format!("{waits}; the receiving thread has not begun"),
-        Some((ago, _)) if ago > RECEPTION_PATIENCE => {
+    let waits = format!("the training thread has waited for {episodes} for {still} s");
+    match receiver {
+        None => format!("{waits}; the receiving thread has not started"),
+        Some((ago, _)) if ago > RECEIVER_PATIENCE => {
             format!(
-                "{waits}; the receiving thread has not come round for {} s",
+                "{waits}; the receiving thread has not responded for {} s",
                 ago.as_secs()
             )
         }
@@ -109,7 +120,7 @@ fn who_waits(phase: Phase, still: Duration, reception: Option<(Duration, Situati
 mod tests {
     use super::*;
 
-    fn nobody() -> Option<(Duration, Situation)> {
+    fn no_actor() -> Option<(Duration, Situation)> {
         let situation = Situation {
             waiting: 3,
             ..Situation::default()
@@ -118,46 +129,57 @@ mod tests {
     }
 
     #[test]
-    fn a_stall_is_told_after_a_while_and_until_something_moves() {
+    fn a_stall_is_reported_after_a_while_and_until_something_moves() {
         let start = Instant::now();
         let at = |secs| start + Duration::from_secs(secs);
         let mut watchdog = Watchdog::new(start);
-        let mut progress = Progress::start(40);
-        assert_eq!(watchdog.look(at(1), &progress, None, nobody()), None);
-        assert_eq!(watchdog.look(at(20), &progress, None, nobody()), None);
-        let told = watchdog.look(at(22), &progress, None, nobody()).unwrap();
+        let mut progress = ProgressReport::start(40);
+        assert_eq!(watchdog.look(at(1), &progress, None, no_actor()), None);
+        assert_eq!(watchdog.look(at(20), &progress, None, no_actor()), None);
+        let stalled = watchdog.look(at(22), &progress, None, no_actor()).unwrap();
         assert_eq!(
-            told,
-            "the training thread has waited for flights for 21 s; no actor is attached; flights that wait for one: 3"
+            stalled,
+            "the training thread has waited for episodes for 21 s; no actor is attached; \
+             episodes that wait for one: 3"
         );
         progress.steps += 1;
-        assert_eq!(watchdog.look(at(23), &progress, None, nobody()), None);
-        progress.phase = Phase::Learning;
-        watchdog.look(at(24), &progress, None, nobody());
-        let told = watchdog.look(at(50), &progress, None, nobody()).unwrap();
-        assert!(told.contains("at one step of its updates for 26 s"), "{told}");
-    }
-
-    #[test]
-    fn a_receiving_thread_that_does_not_come_round_is_named() {
-        let start = Instant::now();
-        let mut watchdog = Watchdog::new(start);
-        let progress = Progress::start(40);
-        watchdog.look(start, &progress, None, None);
-        let stale = nobody().map(|(_, situation)| (Duration::from_secs(33), situation));
-        let told = watchdog.look(start + PATIENCE, &progress, None, stale).unwrap();
+        assert_eq!(watchdog.look(at(23), &progress, None, no_actor()), None);
+        progress.phase = LearnerPhase::Learning;
+        watchdog.look(at(24), &progress, None, no_actor());
+        let stalled = watchdog.look(at(50), &progress, None, no_actor()).unwrap();
         assert!(
-            told.ends_with("the receiving thread has not come round for 33 s"),
-            "{told}"
+            stalled.contains("at one step of its updates for 26 s"),
+            "{stalled}"
         );
     }
 
     #[test]
-    fn a_full_disk_is_told_at_once() {
+    fn a_receiving_thread_that_does_not_respond_is_named() {
+        let start = Instant::now();
+        let mut watchdog = Watchdog::new(start);
+        let progress = ProgressReport::start(40);
+        watchdog.look(start, &progress, None, None);
+        let stale = no_actor().map(|(_, situation)| (Duration::from_secs(33), situation));
+        let stalled = watchdog
+            .look(start + PATIENCE, &progress, None, stale)
+            .unwrap();
+        assert!(
+            stalled.ends_with("the receiving thread has not responded for 33 s"),
+            "{stalled}"
+        );
+    }
+
+    #[test]
+    fn a_full_disk_is_reported_at_once() {
         let start = Instant::now();
         let mut watchdog = Watchdog::new(start);
         let full = "no room for the checkpoint".to_owned();
-        let told = watchdog.look(start, &Progress::start(40), Some(full.clone()), nobody());
-        assert_eq!(told, Some(full));
+        let stalled = watchdog.look(
+            start,
+            &ProgressReport::start(40),
+            Some(full.clone()),
+            no_actor(),
+        );
+        assert_eq!(stalled, Some(full));
     }
 }

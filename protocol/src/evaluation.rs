@@ -1,15 +1,11 @@
-//! `evaluation.json`: how a snapshot flies, course by course.
+//! Evaluation results, `evaluation.json`: how a snapshot flies, course by course.
 
-use std::fmt;
-
-use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, Table};
 use serde::{Deserialize, Serialize};
 
 use crate::ids::PolicyVersion;
 use crate::transition::Outcome;
 
-/// How a snapshot flies: flights in mode action from the start of level 1.
+/// Evaluation of a snapshot: episodes with mode actions from the start of level 1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EvaluationReport {
     /// The snapshot.
@@ -20,92 +16,102 @@ pub struct EvaluationReport {
     pub courses: Vec<CourseEvaluation>,
 }
 
-/// How a snapshot flies one course.
+/// Evaluation of a snapshot on one course.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CourseEvaluation {
     /// The course's name.
     pub course: String,
-    /// Flights flown.
-    pub flights: u64,
-    /// R = (t_1 + … + t_n) / (n · flights): the average rate of obstacles avoided (paper, section 4.4).
+    /// Episodes flown.
+    pub episodes: u64,
+    /// R = (t_1 + … + t_n) / (n · episodes): mean rate of walls passed (paper, section 4.4).
     pub r: f64,
-    /// Share of flights that reached the end wall.
+    /// Share of episodes that reached the end wall.
     pub completed: f64,
-    /// How many they are.
+    /// Episodes that reached the end wall.
     pub reached_end: u64,
-    /// t_n: flights that passed wall n, in flight order.
+    /// t_n: episodes that passed wall n, in course order.
     pub walls_passed: Vec<u64>,
     /// Mean sum of rewards.
     pub mean_return: f64,
-    /// Flights that collided.
+    /// Episodes that collided.
     pub collided: u64,
-    /// Flights cut off by the step limit.
+    /// Episodes cut off by the step limit.
     pub timed_out: u64,
-    /// Where and by what flights failed: an entry for each wall in flight order, and one for the way from the last wall to the end wall. Their sum is that of
-    /// `collided` and `timed_out`.
-    pub failures: Vec<Failures>,
+    /// Failures by place and cause: an entry for each wall in course order, and one for the section
+    /// from the last wall to the end wall. They sum to `collided` plus `timed_out`.
+    pub failures: Vec<WallFailures>,
 }
 
-/// Flights that failed at a wall or on the way to it.
+/// Failed episodes at a wall or on the way to it.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Failures {
-    /// Hit this wall or the edge of its opening, from before or from behind.
+pub struct WallFailures {
+    /// Episodes that hit this wall or the edge of its opening, from either side.
     pub hit_wall: u64,
-    /// Hit a side, the floor or the ceiling of the corridor before they had passed this wall, and after the one before.
+    /// Episodes that hit a side, the floor or the ceiling of the corridor between the previous wall
+    /// and this one.
     pub hit_corridor: u64,
-    /// Ran out of steps there.
+    /// Episodes that reached the step limit there.
     pub timed_out: u64,
 }
 
-/// What an evaluation counts of one flight.
+/// Score of one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FlightScore {
+pub struct EpisodeScore {
     /// Walls passed, from the start of level 1.
     pub walls_passed: u32,
     /// Sum of rewards.
-    pub flight_return: f64,
-    /// How it ended.
+    pub episode_return: f64,
+    /// Outcome.
     pub outcome: Outcome,
-    /// The wall that it hit, from 1 in flight order, if it collided with one and not with the corridor.
+    /// The wall that the episode hit, from 1 in course order; `None` without a collision or for the
+    /// corridor.
     pub hit_wall: Option<u8>,
 }
 
 impl CourseEvaluation {
-    /// Counts `flights` of a course of `walls` walls.
-    pub fn of(course: &str, walls: usize, flights: &[FlightScore]) -> Self {
-        let count = |holds: &dyn Fn(&FlightScore) -> bool| flights.iter().filter(|flight| holds(flight)).count() as u64;
-        let share = |part: u64, whole: usize| if whole == 0 { 0.0 } else { part as f64 / whole as f64 };
-        let walls_passed: Vec<u64> = (1..=walls)
-            .map(|wall| count(&|flight| flight.walls_passed as usize >= wall))
-            .collect();
-        let reached_end = count(&|flight| flight.outcome == Outcome::ReachedEnd);
-        let returns: f64 = flights.iter().map(|flight| flight.flight_return).sum();
-        Self {
-            course: course.to_owned(),
-            flights: flights.len() as u64,
-            r: share(walls_passed.iter().sum(), walls * flights.len()),
-            completed: share(reached_end, flights.len()),
-            reached_end,
-            walls_passed,
-            mean_return: if flights.is_empty() {
+    /// Evaluates `episodes` of a course of `walls` walls.
+    pub fn of(course: &str, walls: usize, episodes: &[EpisodeScore]) -> Self {
+        let count = |holds: &dyn Fn(&EpisodeScore) -> bool| {
+            episodes.iter().filter(|episode| holds(episode)).count() as u64
+        };
+        let share = |part: u64, whole: usize| {
+            if whole == 0 {
                 0.0
             } else {
-                returns / flights.len() as f64
+                part as f64 / whole as f64
+            }
+        };
+        let walls_passed: Vec<u64> = (1..=walls)
+            .map(|wall| count(&|episode| episode.walls_passed as usize >= wall))
+            .collect();
+        let reached_end = count(&|episode| episode.outcome == Outcome::ReachedEnd);
+        let returns: f64 = episodes.iter().map(|episode| episode.episode_return).sum();
+        Self {
+            course: course.to_owned(),
+            episodes: episodes.len() as u64,
+            r: share(walls_passed.iter().sum(), walls * episodes.len()),
+            completed: share(reached_end, episodes.len()),
+            reached_end,
+            walls_passed,
+            mean_return: if episodes.is_empty() {
+                0.0
+            } else {
+                returns / episodes.len() as f64
             },
-            collided: count(&|flight| flight.outcome == Outcome::Collided),
-            timed_out: count(&|flight| flight.outcome == Outcome::TimedOut),
-            failures: Failures::of(walls, flights),
+            collided: count(&|episode| episode.outcome == Outcome::Collided),
+            timed_out: count(&|episode| episode.outcome == Outcome::TimedOut),
+            failures: WallFailures::of(walls, episodes),
         }
     }
 }
 
-impl Failures {
-    /// Counts the failures of `flights` from the start of level 1, `[walls + 1]`.
-    fn of(walls: usize, flights: &[FlightScore]) -> Vec<Self> {
+impl WallFailures {
+    /// Counts the failures of `episodes` from the start of level 1, `[walls + 1]`.
+    fn of(walls: usize, episodes: &[EpisodeScore]) -> Vec<Self> {
         let mut failures = vec![Self::default(); walls + 1];
-        for flight in flights {
-            let next = (flight.walls_passed as usize).min(walls);
-            match (flight.outcome, flight.hit_wall) {
+        for episode in episodes {
+            let next = (episode.walls_passed as usize).min(walls);
+            match (episode.outcome, episode.hit_wall) {
                 (Outcome::ReachedEnd, _) => {}
                 (Outcome::TimedOut, _) => failures[next].timed_out += 1,
                 (Outcome::Collided, None) => failures[next].hit_corridor += 1,
@@ -118,74 +124,25 @@ impl Failures {
     }
 }
 
-/// Counts one after the other, a dot for none; one dot for nothing at all.
-fn counts(values: &[u64]) -> String {
-    if values.iter().all(|&value| value == 0) {
-        return "·".to_owned();
-    }
-    let shown = |&value: &u64| if value == 0 { "·".to_owned() } else { value.to_string() };
-    values.iter().map(shown).collect::<Vec<_>>().join(" ")
-}
-
-impl fmt::Display for EvaluationReport {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table = Table::new();
-        table.load_preset(UTF8_FULL_CONDENSED);
-        table.set_header([
-            "course",
-            "flights",
-            "R",
-            "completed",
-            "passed wall\n1, 2, …",
-            "return",
-            "hit wall\n1, 2, …",
-            "hit corridor\nbefore 1, …, end",
-            "timed out\nbefore 1, …, end",
-        ]);
-        for course in &self.courses {
-            let walls: Vec<String> = course.walls_passed.iter().map(u64::to_string).collect();
-            let failed = |by: fn(&Failures) -> u64| course.failures.iter().map(by).collect::<Vec<_>>();
-            // Behind the last wall there is none to hit.
-            let mut hit_wall = failed(|failures| failures.hit_wall);
-            hit_wall.truncate(walls.len());
-            table.add_row([
-                course.course.clone(),
-                course.flights.to_string(),
-                format!("{:.3}", course.r),
-                format!("{:.1} %", 100.0 * course.completed),
-                walls.join(" "),
-                format!("{:.2}", course.mean_return),
-                counts(&hit_wall),
-                counts(&failed(|failures| failures.hit_corridor)),
-                counts(&failed(|failures| failures.timed_out)),
-            ]);
-        }
-        for column in table.column_iter_mut().skip(1) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-        write!(f, "{table}")
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn r_counts_walls_and_completed_counts_courses() {
-        let score = |walls_passed, outcome| FlightScore {
+        let score = |walls_passed, outcome| EpisodeScore {
             walls_passed,
-            flight_return: 2.0,
+            episode_return: 2.0,
             outcome,
             hit_wall: None,
         };
-        let flights = [
+        let episodes = [
             score(5, Outcome::ReachedEnd),
             score(5, Outcome::Collided),
             score(2, Outcome::Collided),
             score(0, Outcome::TimedOut),
         ];
-        let evaluation = CourseEvaluation::of("training", 5, &flights);
+        let evaluation = CourseEvaluation::of("training", 5, &episodes);
         assert_eq!(evaluation.walls_passed, [3, 3, 2, 2, 2]);
         assert_eq!(evaluation.r, 12.0 / 20.0);
         assert_eq!((evaluation.completed, evaluation.reached_end), (0.25, 1));
@@ -195,23 +152,23 @@ mod tests {
 
     #[test]
     fn every_failure_is_counted_once_where_it_happened() {
-        let score = |walls_passed, outcome, hit_wall| FlightScore {
+        let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
-            flight_return: 0.0,
+            episode_return: 0.0,
             outcome,
             hit_wall,
         };
-        let flights = [
+        let episodes = [
             score(3, Outcome::ReachedEnd, None),
             score(1, Outcome::Collided, Some(2)),
-            // Its centre had left the wall behind when its tail hit it.
+            // The drone's centre had passed the wall when its tail hit it.
             score(2, Outcome::Collided, Some(2)),
             score(2, Outcome::Collided, None),
             score(0, Outcome::TimedOut, None),
             score(3, Outcome::Collided, None),
         ];
-        let evaluation = CourseEvaluation::of("training", 3, &flights);
-        let failures = |hit_wall, hit_corridor, timed_out| Failures {
+        let evaluation = CourseEvaluation::of("training", 3, &episodes);
+        let failures = |hit_wall, hit_corridor, timed_out| WallFailures {
             hit_wall,
             hit_corridor,
             timed_out,
@@ -225,17 +182,10 @@ mod tests {
                 failures(0, 1, 0)
             ]
         );
-        let report = EvaluationReport {
-            policy_version: PolicyVersion(1),
-            policy_sha256: String::new(),
-            courses: vec![evaluation],
-        };
-        let table = report.to_string();
-        assert!(table.contains("┆    · 2 · ┆") && table.contains("· · 1 1"), "{table}");
     }
 
     #[test]
-    fn no_flights_are_no_rate() {
+    fn the_rate_of_zero_episodes_is_zero() {
         assert_eq!(CourseEvaluation::of("training", 5, &[]).r, 0.0);
     }
 }

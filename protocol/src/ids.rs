@@ -1,4 +1,4 @@
-//! Typed numbers: what must not be mixed up has a type of its own.
+//! Typed ids: ids that must not be mixed up have different types.
 
 use std::fmt;
 
@@ -20,35 +20,38 @@ macro_rules! id {
 }
 
 id! {
-    /// One start of a training: distinguishes two runs of one configuration. It names shared memory and records, and never influences learning.
+    /// A training run. It distinguishes two runs of the same configuration; it appears in names of
+    /// shared memory and in records, and never influences learning.
     RunId(u64)
 }
 id! {
-    /// A flight (episode). Training flights count from 0 in the order of their commit; evaluation flights lie above [`FlightId::FIRST_EVALUATION`].
-    FlightId(u64)
+    /// An episode. Training episodes count from 0 in the order of their commit; evaluation episodes
+    /// start at [`EpisodeId::FIRST_EVALUATION`].
+    EpisodeId(u64)
 }
 id! {
-    /// A set of flights flown with one frozen policy.
+    /// A set of episodes flown with one frozen policy.
     Epoch(u64)
 }
 id! {
-    /// Number of a policy snapshot: the parameters after as many epochs of updates.
+    /// Version of a policy snapshot: the number of epochs of updates behind it.
     PolicyVersion(u64)
 }
 id! {
-    /// An actor process of a run; names its log file.
+    /// Number of an actor process of a run, used in the name of its log file.
     ActorId(u32)
 }
 id! {
-    /// One life of an actor process: a restarted actor keeps its id and gets a new incarnation.
-    Incarnation(u64)
+    /// An incarnation of an actor: a restarted actor keeps its id and gets a new incarnation.
+    ActorIncarnation(u64)
 }
 id! {
-    /// How often a flight's ticket had been issued before: tells a flight flown again from its late twin.
+    /// Number of earlier issues of an episode's ticket. It distinguishes an episode flown again
+    /// from a late copy.
     Attempt(u32)
 }
 
-impl FlightId {
-    /// Evaluation flights are numbered from here, so that they never collide with training flights.
+impl EpisodeId {
+    /// First evaluation episode; far above all training episodes.
     pub const FIRST_EVALUATION: Self = Self(1 << 63);
 }

@@ -1,25 +1,17 @@
-//! The contract between Skein's processes.
+//! Types and formats that Skein's processes agree on.
 //!
-//! Everything that two processes must agree on is defined here, and nothing else: who flies what ([`ticket`], [`leg`]), what a flown step looks like on the
-//! wire ([`transition`]), what a policy snapshot contains ([`snapshot`]), the iceoryx2 services that carry them ([`services`]), the configuration of a
-//! run ([`config`]) and the files it leaves ([`run`], [`evaluation`], [`summary`]), and what their time is counted by ([`stages`]); and what all of our programs do alike
-//! ([`allocation`], [`logging`]). It knows neither libtorch nor the physics engine, so that every
-//! process can afford to depend on it.
+//! The crate defines the work of an actor ([`ticket`], [`segment`]), one flown step on the wire
+//! ([`transition`]), a policy snapshot ([`snapshot`]), an actor's reports ([`status`], [`stages`]),
+//! the configuration of a run ([`config`]), and the formats of its files ([`evaluation`],
+//! [`summary`]) and progress reports ([`progress`]). It only defines them: the crate
+//! `skein-transport` carries the records; `skein-run` manages files and processes.
 
-pub mod allocation;
-pub mod claims;
 pub mod config;
-pub mod durable;
 pub mod evaluation;
-pub mod failure;
-pub mod fault;
 pub mod ids;
-pub mod leg;
-pub mod logging;
 pub mod progress;
-pub mod run;
 pub mod seeds;
-pub mod services;
+pub mod segment;
 pub mod snapshot;
 pub mod stages;
 pub mod status;
@@ -27,9 +19,9 @@ pub mod summary;
 pub mod ticket;
 pub mod transition;
 
-/// Version of everything in this crate that crosses a process boundary; part of every service's attributes, so that a process of another version is
-/// refused when it opens a service.
-pub const PROTOCOL_VERSION: u32 = 8;
+/// Version of everything in this crate that crosses a process boundary. It is an attribute of every
+/// service: a process of another version is refused when it opens one.
+pub const PROTOCOL_VERSION: u32 = 9;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -37,16 +29,39 @@ pub const IMAGE_WIDTH: usize = 128;
 pub const IMAGE_HEIGHT: usize = 72;
 /// Pixels, and bytes, of one 8-bit depth image.
 pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
-/// Length of the longest latent code that `vae.latent` allows; records have room for it.
-pub const LONGEST_LATENT: usize = 64;
-/// Room for a latent code of any length. What lies behind a shorter one is zero.
-pub type LatentCode = [f32; LONGEST_LATENT];
+/// Length of the longest latent code that `vae.latent` allows. Records have room for it.
+pub const MAX_LATENT: usize = 64;
+/// Room for a latent code of any length. Values after a shorter code are zero.
+pub type LatentCode = [f32; MAX_LATENT];
+/// Names of the reward's terms, in the order of their sum: those of the simulator's
+/// `reward_terms!`, which `skein-rollout` holds equal to these when it is compiled. Curves are
+/// called `reward/NAME`.
+pub const REWARD_TERM_NAMES: [&str; 4] = ["collision", "level_up", "destination", "open_view"];
+/// Number of the reward's terms.
+pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
-/// Numbers of what the simulator knows of a moment, [`transition::TransitionRecord::ground_truth`].
+/// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
 pub const GROUND_TRUTH: usize = 16;
-/// Length of what a critic gets of a moment that is told the ground truth: that, velocity `[3]`, tilt `[2]` and the action before.
-pub const TRUE_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
-/// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike: beyond them tanh saturates or the noise vanishes (as in the
-/// authors' implementation of arXiv:1812.05905).
+/// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
+/// `[2]` and previous action.
+pub const PRIVILEGED_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
+/// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike. Beyond
+/// them tanh saturates or the noise vanishes (as in the authors' implementation of
+/// arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
+
+/// Returns the sizes of the records on the wire, and the reward's terms. Processes in which all are
+/// equal can read each other's records.
+pub fn record_layout() -> String {
+    format!(
+        "transition {} control {} segment {} status {} snapshot header {} \
+         reward {}",
+        size_of::<transition::TransitionRecord>(),
+        size_of::<ticket::ControlRecord>(),
+        size_of::<segment::SegmentRecord>(),
+        size_of::<status::StatusRecord>(),
+        size_of::<snapshot::SnapshotHeader>(),
+        REWARD_TERM_NAMES.join("+"),
+    )
+}

@@ -1,4 +1,4 @@
-//! One tracing subscriber, set up in one place; one log file a process.
+//! Logging: one tracing subscriber and one log file per process.
 
 use std::fs::OpenOptions;
 use std::path::Path;
@@ -6,18 +6,19 @@ use std::sync::Mutex;
 
 use tracing_subscriber::EnvFilter;
 
-/// How log lines are written.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum LogFormat {
-    /// For people.
+    /// Text for people.
     #[default]
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
 impl LogFormat {
-    /// JSON when the environment variable `SKEIN_LOG_FORMAT` is `json`.
+    /// Returns [`LogFormat::Json`] if the environment variable `SKEIN_LOG_FORMAT` is `json`, else
+    /// text.
     pub fn from_environment() -> Self {
         match std::env::var("SKEIN_LOG_FORMAT") {
             Ok(format) if format == "json" => Self::Json,
@@ -26,13 +27,13 @@ impl LogFormat {
     }
 }
 
-/// Sends this process's log to `path`, appending; `RUST_LOG` says what is logged, `info` by default.
+/// Appends this process's log to `path`. `RUST_LOG` filters it, `info` by default.
 ///
 /// # Errors
-/// When the file cannot be opened.
+/// If the file cannot be opened.
 ///
 /// # Panics
-/// When called twice.
+/// If called twice.
 pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
     let file = Mutex::new(OpenOptions::new().create(true).append(true).open(path)?);
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("info"));
@@ -44,7 +45,7 @@ pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
         LogFormat::Text => subscriber.init(),
         LogFormat::Json => subscriber.json().init(),
     }
-    // A panic is a defect; it must not only scroll away on a terminal.
+    // A panic is a defect and must appear in the log, not only on the terminal.
     let default_hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |panic| {
         tracing::error!(%panic, "panic");

@@ -1,64 +1,67 @@
-//! How far a run has come: one line of JSON on the learner's standard output for each report, for whoever watches it.
+//! Progress reports: one line of JSON each on the learner's standard output.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// A report of the learner.
+/// Progress report of the learner.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
-    /// What the learner is about.
-    pub phase: Phase,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Training flights in the whole run.
-    pub total_flights: u64,
-    /// Evaluation flights committed and to be flown in the present evaluation.
-    pub evaluation_flights: (u64, u64),
+pub struct ProgressReport {
+    /// Current phase of the learner.
+    pub phase: LearnerPhase,
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Training episodes of the run.
+    pub total_episodes: u64,
+    /// Evaluation episodes of the current evaluation: committed and total.
+    pub evaluation_episodes: (u64, u64),
     /// Environment steps committed.
     pub steps: u64,
-    /// SAC updates done.
+    /// Policy updates done.
     pub updates: u64,
-    /// VAE steps done.
+    /// VAE updates done.
     pub vae_updates: u64,
-    /// Environment steps per second, over the last few seconds.
+    /// Environment steps per second over the last few seconds.
     pub steps_per_sec: f64,
-    /// SAC updates per second, over the last few seconds.
+    /// Policy updates per second over the last few seconds.
     pub updates_per_sec: f64,
-    /// Walls passed per flight, over the last 50 flights.
+    /// Mean walls passed per episode over the last 50 episodes.
     pub walls_passed: Option<f64>,
-    /// Sum of rewards per flight, over the last 50 flights.
+    /// Mean sum of rewards per episode over the last 50 episodes.
     pub mean_return: Option<f64>,
-    /// Temperature α, once there were updates.
+    /// Temperature α, after the first update.
     pub temperature: Option<f64>,
     /// VAE loss of the last epoch that trained it.
     pub vae_loss: Option<f64>,
-    /// Actors that gave a sign of life.
+    /// Living actors, by their heartbeats.
     pub actors: usize,
-    /// Their numbers, in ascending order.
+    /// Numbers of the living actors, in ascending order.
     #[serde(default)]
     pub live_actors: Vec<u32>,
-    /// Tickets issued again since the learner's start, by reason; without reasons that did not occur.
+    /// Tickets issued again since the learner's start, by reason; reasons that did not occur are
+    /// left out.
     #[serde(default)]
     pub reissued: BTreeMap<String, u64>,
-    /// Records refused since the learner's start, by reason; without reasons that did not occur.
+    /// Records refused since the learner's start, by reason; reasons that did not occur are left
+    /// out.
     #[serde(default)]
     pub refused: BTreeMap<String, u64>,
-    /// Who waits for whom, when nothing has moved for a while.
+    /// Description of who waits for whom, if nothing has moved for a while.
     #[serde(default)]
     pub stalled: Option<String>,
-    /// Seconds that the learner has run, earlier lives included as far as checkpoints tell.
+    /// Seconds that the learner has run, including earlier incarnations as far as checkpoints
+    /// record them.
     pub elapsed_secs: f64,
 }
 
-impl Progress {
-    /// Of a run of `total_flights` training flights that has not begun.
-    pub fn start(total_flights: u64) -> Self {
+impl ProgressReport {
+    /// Returns the report of a run of `total_episodes` training episodes that has not begun.
+    pub fn start(total_episodes: u64) -> Self {
         Self {
-            phase: Phase::Flying,
-            flights: 0,
-            total_flights,
-            evaluation_flights: (0, 0),
+            phase: LearnerPhase::Flying,
+            episodes: 0,
+            total_episodes,
+            evaluation_episodes: (0, 0),
             steps: 0,
             updates: 0,
             vae_updates: 0,
@@ -78,16 +81,16 @@ impl Progress {
     }
 }
 
-/// What the learner is about.
+/// Current phase of the learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Phase {
-    /// Waits for flights.
+pub enum LearnerPhase {
+    /// Waits for training episodes.
     Flying,
     /// Updates the networks.
     Learning,
-    /// Confirms a candidate for the best snapshot, or evaluates it at the end.
+    /// Waits for evaluation episodes, of a candidate or at the end.
     Evaluating,
-    /// Writes what remains.
+    /// Writes the final files.
     Finishing,
 }

@@ -1,45 +1,49 @@
-//! One seed for the run, and from it an independent one for every purpose.
+//! Seeds: one for the run, and derived from it an independent one for every purpose.
 //!
-//! Nothing that draws at random keeps a generator alive: it derives one from (run seed, purpose, index). So the draws depend on *what* is drawn for,
-//! never on when or where, and there is no generator state to store in a checkpoint.
+//! No code keeps a random generator alive: each draw derives one from (run seed, purpose, index).
+//! So random numbers depend on their purpose, never on time or place, and a checkpoint stores no
+//! generator state.
 
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
-/// What randomness is drawn for. The discriminants are part of every result: never renumber them.
+/// Purpose of random numbers. The discriminants are part of every result: never renumber them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u64)]
 pub enum Purpose {
-    /// Start position and exploration noise of one training flight; indexed by flight.
-    Flight = 1,
-    /// Start position of one evaluation flight; indexed by its number within the evaluation.
-    EvaluationFlight = 2,
-    /// Whether a training flight is flown on a generated course, and which; indexed by flight.
+    /// Start position and exploration noise of one training episode; indexed by episode.
+    Episode = 1,
+    /// Start position of one evaluation episode; indexed by its number within the evaluation.
+    EvaluationEpisode = 2,
+    /// Choice of a generated course for a training episode; indexed by episode.
     Course = 3,
     /// Initial parameters of the VAE.
     VaeParameters = 4,
     /// Initial parameters of policy and critic.
     PolicyParameters = 5,
-    /// Minibatches drawn for the policy updates between two snapshots; indexed by the former's version, which is the epoch unless flights are flown in legs.
+    /// Minibatches of the policy updates between two snapshots; indexed by the version of the
+    /// first, which is the epoch unless episodes are flown in segments.
     PolicyBatches = 6,
-    /// Action noise inside the policy updates between two snapshots; indexed likewise.
+    /// Action noise of the policy updates between two snapshots; indexed likewise.
     PolicyNoise = 7,
-    /// Minibatches drawn for the VAE steps between two snapshots; indexed likewise.
+    /// Minibatches of the VAE updates between two snapshots; indexed likewise.
     VaeBatches = 8,
-    /// Reparameterisation noise of the VAE steps between two snapshots; indexed likewise.
+    /// Reparameterisation noise of the VAE updates between two snapshots; indexed likewise.
     VaeNoise = 9,
-    /// Where one flight starts; derived from the ticket's seed.
+    /// Start position of an episode; derived from the ticket's seed.
     StartPosition = 10,
-    /// Exploration noise of one flight, or of the leg of it that begins at the step of this index; derived from the ticket's seed, so that a start drawn otherwise does not shift it.
+    /// Exploration noise of an episode or segment, indexed by its first step; derived from the
+    /// ticket's seed, so that it does not depend on how the start is drawn.
     ActionNoise = 11,
-    /// What disturbs one flight; derived from the ticket's seed.
+    /// Disturbances of an episode; derived from the ticket's seed.
     Disturbances = 12,
-    /// Resamples of the runs of an experiment, from which the uncertainty of what it found is told; the seed is their number, the index that of the resamples.
+    /// Bootstrap resamples of the runs of an experiment, for the uncertainty of its results. The
+    /// seed is the number of runs, the index that of the resamples.
     Bootstrap = 13,
-    /// Generated course on which a candidate for the best snapshot is confirmed; indexed by flight.
+    /// Generated course of a confirmation episode; indexed by episode.
     ConfirmationCourse = 14,
 }
 
-/// The seed for the `index`-th use of `purpose` in the run seeded `run_seed`.
+/// Returns the seed for the `index`-th use of `purpose` in the run seeded `run_seed`.
 pub fn derive(run_seed: u64, purpose: Purpose, index: u64) -> u64 {
     let mut bytes = [0; 16];
     bytes[..8].copy_from_slice(&(purpose as u64).to_le_bytes());
@@ -53,10 +57,10 @@ mod tests {
 
     #[test]
     fn seeds_differ_by_run_purpose_and_index() {
-        let base = derive(1, Purpose::Flight, 0);
-        assert_ne!(base, derive(2, Purpose::Flight, 0));
-        assert_ne!(base, derive(1, Purpose::EvaluationFlight, 0));
-        assert_ne!(base, derive(1, Purpose::Flight, 1));
-        assert_eq!(base, derive(1, Purpose::Flight, 0));
+        let base = derive(1, Purpose::Episode, 0);
+        assert_ne!(base, derive(2, Purpose::Episode, 0));
+        assert_ne!(base, derive(1, Purpose::EvaluationEpisode, 0));
+        assert_ne!(base, derive(1, Purpose::Episode, 1));
+        assert_eq!(base, derive(1, Purpose::Episode, 0));
     }
 }

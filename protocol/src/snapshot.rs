@@ -1,7 +1,9 @@
-//! The policy snapshot: what an actor needs to fly, as one range of bytes.
+//! The policy snapshot: the encoder and policy parameters that an actor flies with, as one range of
+//! bytes.
 //!
-//! A snapshot is the encoder's and the policy's parameters, back to back, f32 little-endian, in the order of [`SnapshotLayout`]. It travels over shared
-//! memory behind a [`SnapshotHeader`], and lies on disk as safetensors with the run's configuration in its metadata, so that a file alone can be flown.
+//! The parameters lie back to back, f32 little-endian, in the order of [`SnapshotLayout`]. In
+//! shared memory a [`SnapshotHeader`] precedes them. On disk they are safetensors with the run's
+//! configuration in the metadata, so that the file alone can be flown.
 
 use std::collections::HashMap;
 use std::fs;
@@ -9,16 +11,16 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-use crate::config::{AlgorithmName, Config, View};
+use crate::ACTION;
+use crate::config::{AlgorithmName, Config, ObservationLayout};
 use crate::ids::{PolicyVersion, RunId};
-use crate::{ACTION, durable};
 
-/// Channels of the encoder's four 4×4 convolutions of stride 2; the first is the image's (paper, section 3.3; widths as in arXiv:1803.10122).
+/// Channels of the encoder's four 4×4 convolutions of stride 2; the first entry is the image's
+/// (paper, section 3.3; widths as in arXiv:1803.10122).
 pub const ENCODER_CHANNELS: [usize; 5] = [1, 32, 64, 128, 256];
 /// Width and height of the encoder's kernels.
 pub const ENCODER_KERNEL: usize = 4;
@@ -32,23 +34,24 @@ pub const POLICY_LAYERS: usize = 4;
 pub struct TensorSpec {
     /// `part.layer.kind`, e.g. `encoder.conv1.weight`.
     pub name: String,
-    /// PyTorch's convention: `[out, in, height, width]`, `[out, in]` or `[out]`.
+    /// Shape in PyTorch's convention: `[out, in, height, width]`, `[out, in]` or `[out]`.
     pub shape: Vec<usize>,
-    /// Where its f32 values lie, counted in values.
+    /// Position of its f32 values, counted in values.
     pub range: Range<usize>,
 }
 
-/// What the numbers are that a policy gives, and so how actions are drawn.
+/// Meaning of a policy's outputs, and so how actions are drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PolicyHead {
-    /// Mean and log standard deviation of a Gaussian that tanh squashes, `[2]` each.
+    /// Mean and log standard deviation of a Gaussian squashed by tanh, `[2]` each.
     SquashedGaussian,
-    /// The action before tanh, `[2]`. To explore, noise of this standard deviation is added after it, and the sum kept in [-1, 1].
+    /// The action before tanh, `[2]`. Exploration adds noise of this standard deviation after tanh
+    /// and clamps the sum to [-1, 1].
     Noisy(f32),
 }
 
 impl PolicyHead {
-    /// Numbers that the policy gives.
+    /// Returns the number of outputs.
     pub fn outputs(self) -> usize {
         match self {
             Self::SquashedGaussian => 2 * ACTION,
@@ -57,7 +60,7 @@ impl PolicyHead {
     }
 }
 
-/// Which tensors a snapshot holds, and where.
+/// Names, shapes and positions of the tensors in a snapshot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SnapshotLayout {
     tensors: Vec<TensorSpec>,
@@ -66,13 +69,15 @@ pub struct SnapshotLayout {
 }
 
 impl SnapshotLayout {
-    /// The layout for policies that see `view`, have hidden layers of `hidden_width`, and give a squashed Gaussian.
-    pub fn new(view: &View, hidden_width: usize) -> Self {
+    /// Returns the layout for policies with this observation, hidden layers of `hidden_width` and a
+    /// squashed Gaussian.
+    pub fn new(view: &ObservationLayout, hidden_width: usize) -> Self {
         Self::with_head(view, hidden_width, PolicyHead::SquashedGaussian)
     }
 
-    /// The same for policies that give what `head` says.
-    pub fn with_head(view: &View, hidden_width: usize, head: PolicyHead) -> Self {
+    /// Returns the layout for policies with this observation, hidden layers of `hidden_width` and
+    /// this head.
+    pub fn with_head(view: &ObservationLayout, hidden_width: usize, head: PolicyHead) -> Self {
         let mut layout = Self {
             tensors: Vec::new(),
             encoder_values: 0,
@@ -84,14 +89,20 @@ impl SnapshotLayout {
         }
         layout.push_layer("encoder.mean", &[view.latent, ENCODER_FEATURES]);
         layout.encoder_values = layout.values();
-        let widths = [view.len(), hidden_width, hidden_width, hidden_width, head.outputs()];
+        let widths = [
+            view.len(),
+            hidden_width,
+            hidden_width,
+            hidden_width,
+            head.outputs(),
+        ];
         for (index, pair) in widths.windows(2).enumerate() {
             layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
         }
         layout
     }
 
-    /// The layout a configuration asks for.
+    /// Returns the layout for a configuration.
     pub fn of(config: &Config) -> Self {
         let (hidden_width, head) = match config.learning.algorithm {
             AlgorithmName::Sac => (config.sac.hidden_width, PolicyHead::SquashedGaussian),
@@ -100,10 +111,10 @@ impl SnapshotLayout {
                 PolicyHead::Noisy(config.td3.exploration_noise as f32),
             ),
         };
-        Self::with_head(&config.view(), hidden_width, head)
+        Self::with_head(&config.observation_layout(), hidden_width, head)
     }
 
-    /// What the policy's numbers are.
+    /// Returns the policy's head.
     pub fn head(&self) -> PolicyHead {
         self.head
     }
@@ -122,32 +133,32 @@ impl SnapshotLayout {
         });
     }
 
-    /// The tensors in order.
+    /// Returns the tensors in order.
     pub fn tensors(&self) -> &[TensorSpec] {
         &self.tensors
     }
 
-    /// The tensor of this name.
+    /// Returns the tensor of this name.
     pub fn tensor(&self, name: &str) -> Option<&TensorSpec> {
         self.tensors.iter().find(|tensor| tensor.name == name)
     }
 
-    /// Values in a snapshot.
+    /// Returns the number of values in a snapshot.
     pub fn values(&self) -> usize {
         self.tensors.last().map_or(0, |tensor| tensor.range.end)
     }
 
-    /// Where the encoder's values lie: before the policy's.
+    /// Returns the range of the encoder's values, which precede the policy's.
     pub fn encoder(&self) -> Range<usize> {
         0..self.encoder_values
     }
 
-    /// Where the policy's values lie.
+    /// Returns the range of the policy's values.
     pub fn policy(&self) -> Range<usize> {
         self.encoder_values..self.values()
     }
 
-    /// Fingerprint of names and shapes, compared by both ends of the weights service.
+    /// Returns a fingerprint of names and shapes, compared by both ends of the weights service.
     pub fn digest(&self) -> u64 {
         let text: Vec<String> = self
             .tensors
@@ -158,14 +169,13 @@ impl SnapshotLayout {
     }
 }
 
-/// What precedes a snapshot's values in shared memory.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+/// Header of a snapshot in shared memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.SnapshotHeader.v1")]
 pub struct SnapshotHeader {
     /// The run.
     pub run: u64,
-    /// The version.
+    /// The policy version.
     pub policy_version: u64,
     /// [`SnapshotLayout::digest`].
     pub layout: u64,
@@ -179,40 +189,41 @@ const _: () = assert!(size_of::<SnapshotHeader>() == 4 * 8);
 /// A frozen policy: the parameters of encoder and policy.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
-    /// Its number.
+    /// Policy version.
     pub version: PolicyVersion,
     /// The parameters in the order of the layout.
     pub values: Vec<f32>,
 }
 
-/// Why a snapshot is not flown.
+/// Reason why a snapshot is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum SnapshotError {
-    /// It belongs to another run.
+    /// The snapshot belongs to another run.
     #[error("the snapshot belongs to run {found:016x}, not to {expected:016x}")]
     OtherRun {
-        /// Its run.
+        /// The snapshot's run.
         found: u64,
-        /// Ours.
+        /// This run.
         expected: u64,
     },
-    /// Its tensors are not ours.
+    /// The snapshot has other tensors.
     #[error(
-        "the snapshot has another layout: learning.algorithm, its hidden_width, learning.observation, learning.history_steps or vae.latent differ"
+        "the snapshot has another layout: learning.algorithm, its hidden_width, \
+        learning.observation, learning.history_steps or vae.latent differ"
     )]
     OtherLayout,
-    /// Its length is not that of the layout.
-    #[error("the snapshot has {found} bytes where its layout has {expected}")]
+    /// The length does not match the layout.
+    #[error("the snapshot has {found} bytes, its layout {expected}")]
     Length {
-        /// Its length.
+        /// The snapshot's length in bytes.
         found: usize,
-        /// The layout's.
+        /// The layout's length in bytes.
         expected: usize,
     },
-    /// Its bytes are damaged.
+    /// The bytes are damaged.
     #[error("the snapshot's checksum does not match its bytes")]
     Damaged,
-    /// A parameter is not a number.
+    /// A parameter is not finite.
     #[error("the snapshot's tensor {tensor} holds a value that is not finite")]
     NotFinite {
         /// The tensor.
@@ -223,22 +234,22 @@ pub enum SnapshotError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: std::io::Error,
     },
-    /// The file is no snapshot of ours.
+    /// The file is not a snapshot of this version.
     #[error("{} is not a snapshot of this version: {problem}", path.display())]
     Format {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
     },
 }
 
 impl Snapshot {
-    /// The header that goes before the values.
+    /// Returns the header that precedes the values.
     pub fn header(&self, run: RunId, layout: &SnapshotLayout) -> SnapshotHeader {
         SnapshotHeader {
             run: run.0,
@@ -248,10 +259,10 @@ impl Snapshot {
         }
     }
 
-    /// Reads a snapshot out of shared memory.
+    /// Reads a snapshot from shared memory.
     ///
     /// # Errors
-    /// [`SnapshotError`] when it is of another run or layout, or damaged.
+    /// [`SnapshotError`] if it is of another run or layout, or damaged.
     pub fn receive(
         header: &SnapshotHeader,
         bytes: &[u8],
@@ -286,7 +297,11 @@ impl Snapshot {
     }
 
     fn check_finite(&self, layout: &SnapshotLayout) -> Result<(), SnapshotError> {
-        let broken = |tensor: &&TensorSpec| self.values[tensor.range.clone()].iter().any(|value| !value.is_finite());
+        let broken = |tensor: &&TensorSpec| {
+            self.values[tensor.range.clone()]
+                .iter()
+                .any(|value| !value.is_finite())
+        };
         match layout.tensors().iter().find(broken) {
             Some(tensor) => Err(SnapshotError::NotFinite {
                 tensor: tensor.name.clone(),
@@ -295,45 +310,44 @@ impl Snapshot {
         }
     }
 
-    /// SHA-256 of the parameters' bytes, in hexadecimal: equal exactly when two policies are bit-equal.
+    /// Returns the SHA-256 of the parameters' bytes in hexadecimal: equal exactly if two policies
+    /// are bit-equal.
     pub fn sha256(&self) -> String {
         let digest = Sha256::digest(bytemuck::cast_slice::<f32, u8>(&self.values));
         digest.iter().map(|byte| format!("{byte:02x}")).collect()
     }
 
-    /// Writes the snapshot as safetensors, with `config` in its metadata, [portable](Config::portable); on disk in its place, or not at all.
+    /// Returns the snapshot as a safetensors file, with the [portable](Config::portable) `config`
+    /// in its metadata.
     ///
-    /// # Errors
-    /// [`SnapshotError::Io`] names the file.
-    pub fn save(&self, path: &Path, layout: &SnapshotLayout, config: &Config) -> Result<(), SnapshotError> {
+    /// # Panics
+    /// If the number of values does not match `layout`.
+    pub fn to_file(&self, layout: &SnapshotLayout, config: &Config) -> Vec<u8> {
         let bytes: &[u8] = bytemuck::cast_slice(&self.values);
         let views = layout.tensors().iter().map(|tensor| {
             let range = tensor.range.start * size_of::<f32>()..tensor.range.end * size_of::<f32>();
-            let view = TensorView::new(Dtype::F32, tensor.shape.clone(), &bytes[range])
+            let tensor_view = TensorView::new(Dtype::F32, tensor.shape.clone(), &bytes[range])
                 .expect("a tensor's range is as long as its shape says");
-            (tensor.name.clone(), view)
+            (tensor.name.clone(), tensor_view)
         });
         let (version, config) = (self.version.to_string(), config.portable());
         let metadata = HashMap::from([
             (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
-            (CHECKSUM_KEY.to_owned(), checksum(&version, &config, &self.values)),
+            (
+                CHECKSUM_KEY.to_owned(),
+                checksum(&version, &config, &self.values),
+            ),
             (VERSION_KEY.to_owned(), version),
             (CONFIG_KEY.to_owned(), config),
         ]);
-        let file = safetensors::serialize(views, Some(metadata)).map_err(|error| SnapshotError::Format {
-            path: path.to_owned(),
-            problem: error.to_string(),
-        })?;
-        durable::replace(path, &file).map_err(|source| SnapshotError::Io {
-            path: path.to_owned(),
-            source,
-        })
+        safetensors::serialize(views, Some(metadata)).expect("names and shapes are plain data")
     }
 
-    /// Reads a snapshot file and the configuration it was trained with, which names its courses' files, and not where they lie.
+    /// Reads a snapshot file and the configuration it was trained with. That configuration holds
+    /// the names of course files, not their folders.
     ///
     /// # Errors
-    /// [`SnapshotError`] names the file and what is wrong with it.
+    /// [`SnapshotError`] names the file and the problem.
     pub fn load(path: &Path) -> Result<(Self, Config), SnapshotError> {
         let bytes = fs::read(path).map_err(|source| SnapshotError::Io {
             path: path.to_owned(),
@@ -342,10 +356,10 @@ impl Snapshot {
         Self::parse(&bytes, path)
     }
 
-    /// Reads a snapshot from the `bytes` of a snapshot file. `path` is named in errors only.
+    /// Reads a snapshot from the `bytes` of a snapshot file. `path` only appears in errors.
     ///
     /// # Errors
-    /// As [`Snapshot::load`].
+    /// The same as [`Snapshot::load`].
     pub fn parse(bytes: &[u8], path: &Path) -> Result<(Self, Config), SnapshotError> {
         parse_file(bytes).map_err(|problem| SnapshotError::Format {
             path: path.to_owned(),
@@ -356,12 +370,13 @@ impl Snapshot {
 
 const FORMAT_KEY: &str = "skein.format";
 const FORMAT: &str = "policy-snapshot-2";
-/// See [`checksum`].
+/// Metadata key of the [`checksum`].
 const CHECKSUM_KEY: &str = "skein.checksum";
 const VERSION_KEY: &str = "skein.policy_version";
 const CONFIG_KEY: &str = "skein.config";
 
-/// xxh3 of all that a snapshot file says, hexadecimal: a flipped bit that leaves finite numbers is seen by nothing else.
+/// Returns the xxh3 of a snapshot file's content in hexadecimal. Nothing else detects a flipped bit
+/// that leaves finite numbers.
 fn checksum(version: &str, config: &str, values: &[f32]) -> String {
     let mut hasher = Xxh3::new();
     for text in [version, config] {
@@ -375,14 +390,22 @@ fn checksum(version: &str, config: &str, values: &[f32]) -> String {
 fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
     let metadata = metadata.metadata().as_ref().ok_or("it has no metadata")?;
-    let value = |key: &str| metadata.get(key).ok_or(format!("its metadata has no {key}"));
+    let value = |key: &str| {
+        metadata
+            .get(key)
+            .ok_or(format!("its metadata has no {key}"))
+    };
     if value(FORMAT_KEY)? != FORMAT {
-        return Err(format!("its format is {}, not {FORMAT}", value(FORMAT_KEY)?));
+        return Err(format!(
+            "its format is {}, not {FORMAT}",
+            value(FORMAT_KEY)?
+        ));
     }
     let version = value(VERSION_KEY)?
         .parse()
         .map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
-    let config: Config = toml::from_str(value(CONFIG_KEY)?).map_err(|error| format!("its configuration: {error}"))?;
+    let config: Config = toml::from_str(value(CONFIG_KEY)?)
+        .map_err(|error| format!("its configuration: {error}"))?;
     config
         .validate()
         .map_err(|error| format!("its configuration: {error}"))?;
@@ -390,7 +413,9 @@ fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let layout = SnapshotLayout::of(&config);
     let mut values = Vec::with_capacity(layout.values());
     for tensor in layout.tensors() {
-        let view = file.tensor(&tensor.name).map_err(|error| error.to_string())?;
+        let view = file
+            .tensor(&tensor.name)
+            .map_err(|error| error.to_string())?;
         if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
             return Err(format!(
                 "{} is {:?} {:?}, not F32 {:?}",
@@ -409,15 +434,17 @@ fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let found = checksum(value(VERSION_KEY)?, value(CONFIG_KEY)?, &snapshot.values);
     if *value(CHECKSUM_KEY)? != found {
         return Err(format!(
-            "it is damaged: the checksum of its content is {found} where {} is expected",
+            "it is damaged: the checksum of its content is {found}, expected {}",
             value(CHECKSUM_KEY)?
         ));
     }
-    snapshot.check_finite(&layout).map_err(|error| error.to_string())?;
+    snapshot
+        .check_finite(&layout)
+        .map_err(|error| error.to_string())?;
     Ok((snapshot, config))
 }
 
-/// f32 values from bytes that need not be aligned.
+/// Reads f32 values from bytes that need not be aligned.
 fn values_of(bytes: &[u8]) -> Vec<f32> {
     bytes
         .chunks_exact(4)
@@ -430,12 +457,14 @@ mod tests {
     use super::*;
     use crate::config::Observation;
 
-    fn view() -> View {
-        View::present(Observation::LatentVelocity, 32)
+    fn view() -> ObservationLayout {
+        ObservationLayout::present(Observation::LatentVelocity, 32)
     }
 
     fn snapshot(layout: &SnapshotLayout) -> Snapshot {
-        let values = (0..layout.values()).map(|index| (index as f32).sin()).collect();
+        let values = (0..layout.values())
+            .map(|index| (index as f32).sin())
+            .collect();
         Snapshot {
             version: PolicyVersion(12),
             values,
@@ -463,7 +492,10 @@ mod tests {
         let sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let bytes = bytemuck::cast_slice(&sent.values);
-        assert_eq!(Snapshot::receive(&header, bytes, RunId(1), &layout).unwrap(), sent);
+        assert_eq!(
+            Snapshot::receive(&header, bytes, RunId(1), &layout).unwrap(),
+            sent
+        );
     }
 
     #[test]
@@ -472,14 +504,16 @@ mod tests {
         let mut sent = snapshot(&layout);
         let header = sent.header(RunId(1), &layout);
         let mut bytes = bytemuck::cast_slice(&sent.values).to_vec();
-        let receive = |bytes: &[u8], run, layout: &SnapshotLayout| Snapshot::receive(&header, bytes, run, layout);
+        let receive = |bytes: &[u8], run, layout: &SnapshotLayout| {
+            Snapshot::receive(&header, bytes, run, layout)
+        };
         assert!(matches!(
             receive(&bytes, RunId(2), &layout),
             Err(SnapshotError::OtherRun { .. })
         ));
-        // An observation more, and a code that is longer by as many numbers as are not seen beside it.
-        for (moment, latent) in [(Observation::Latent, 32), (Observation::Latent, 34)] {
-            let other = SnapshotLayout::new(&View::present(moment, latent), 64);
+        // A shorter observation, and a longer code with the same observation length.
+        for (per_step, latent) in [(Observation::Latent, 32), (Observation::Latent, 34)] {
+            let other = SnapshotLayout::new(&ObservationLayout::present(per_step, latent), 64);
             assert!(matches!(
                 receive(&bytes, RunId(1), &other),
                 Err(SnapshotError::OtherLayout)
@@ -496,8 +530,18 @@ mod tests {
         ));
         sent.values[5] = f32::NAN;
         let header = sent.header(RunId(1), &layout);
-        let poisoned = Snapshot::receive(&header, bytemuck::cast_slice(&sent.values), RunId(1), &layout);
-        assert!(poisoned.unwrap_err().to_string().contains("encoder.conv1.weight"));
+        let poisoned = Snapshot::receive(
+            &header,
+            bytemuck::cast_slice(&sent.values),
+            RunId(1),
+            &layout,
+        );
+        assert!(
+            poisoned
+                .unwrap_err()
+                .to_string()
+                .contains("encoder.conv1.weight")
+        );
     }
 
     #[test]
@@ -508,7 +552,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("best.safetensors");
         let saved = snapshot(&layout);
-        saved.save(&path, &layout, &config).unwrap();
+        fs::write(&path, saved.to_file(&layout, &config)).unwrap();
         let (loaded, loaded_config) = Snapshot::load(&path).unwrap();
         assert_eq!(loaded, saved);
         assert_eq!(loaded.sha256(), saved.sha256());
@@ -516,10 +560,11 @@ mod tests {
         assert_eq!(
             loaded_config.courses.training.as_os_str(),
             "training.toml",
-            "nobody's folders are told"
+            "the file names no folder"
         );
         let sound = fs::read(&path).unwrap();
-        // All of its header, where a bit may change a name or a place, and a thousand positions of its parameters.
+        // The whole header, where a bit may change a name or a position, and a thousand positions
+        // among the parameters.
         let header = 8 + u64::from_le_bytes(*sound.first_chunk().unwrap()) as usize;
         let parameters = (header..sound.len()).step_by((sound.len() - header) / 1000);
         for index in (0..header).chain(parameters) {

@@ -1,20 +1,17 @@
-//! Where time goes: every stage of the data's way, and what each thread has spent on it.
+//! Time measurement: the stages of the data flow, and the time that each thread spends in them.
 //!
-//! A [`LapTimer`] is never stopped: each lap books the time since the one before to a stage. So a thread's stages are its whole time and their shares sum
-//! to one, and a lap costs a single reading of the clock. Nothing that is learned depends on any of it.
+//! A [`LapTimer`] never stops: each lap assigns the time since the last one to a stage. So a
+//! thread's stages cover its whole time, their shares sum to one, and a lap costs a single clock
+//! reading. Learning depends on none of it.
 
-use std::fmt;
 use std::time::{Duration, Instant};
 
 use bytemuck::{Pod, Zeroable};
-use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, Table};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-/// Whose time it is.
+/// ThreadRole or group of threads that time is measured for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Thread {
+pub enum ThreadRole {
     /// All actors together; each has one thread.
     Actors,
     /// The learner's receiving thread.
@@ -23,8 +20,8 @@ pub enum Thread {
     Training,
 }
 
-impl Thread {
-    /// In the summary.
+impl ThreadRole {
+    /// Returns the name in the summary.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Actors => "actors",
@@ -32,34 +29,27 @@ impl Thread {
             Self::Training => "training",
         }
     }
-
-    const fn title(self) -> &'static str {
-        match self {
-            Self::Actors => "actors, together",
-            Self::Receiving => "learner: receiving",
-            Self::Training => "learner: training",
-        }
-    }
 }
 
 macro_rules! stages {
     ($($thread:ident { $($(#[$doc:meta])* $stage:ident => $name:literal),* $(,)? })*) => {
-        /// What a thread is at, in the order of the data's way. The first sentence of each says what is done, the second what is counted.
+        /// A stage of a thread's work, in the order of the data flow. In each description the first
+        /// sentence says what is done, the second what is counted.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Stage { $($($(#[$doc])* $stage),*),* }
 
         impl Stage {
-            /// All of them, in the order of the data's way.
+            /// All stages, in the order of the data flow.
             pub const ALL: &[Self] = &[$($(Self::$stage),*),*];
 
-            /// In the summary and the table; a thread has it once.
+            /// Returns the name in the summary and the table; unique within a thread.
             pub const fn name(self) -> &'static str {
                 match self { $($(Self::$stage => $name),*),* }
             }
 
-            /// Whose it is.
-            pub const fn thread(self) -> Thread {
-                match self { $($(Self::$stage => Thread::$thread),*),* }
+            /// Returns the thread of the stage.
+            pub const fn thread(self) -> ThreadRole {
+                match self { $($(Self::$stage => ThreadRole::$thread),*),* }
             }
         }
     };
@@ -67,13 +57,15 @@ macro_rules! stages {
 
 stages! {
     Actors {
-        /// Snapshots are taken in and made ready to fly with. Snapshots.
+        /// Snapshots are received and prepared for flying. Snapshots.
         TakeSnapshot => "snapshot",
-        /// The simulator is set to the start of a flight, or to where a leg begins. Flights, legs.
-        TakeOff => "take-off",
+        /// The simulator is set to the start of an episode, or to where a segment begins. Episodes,
+        /// segments.
+        Reset => "reset",
         /// The drone moves until its next decision. Environment steps.
         Physics => "physics",
-        /// A depth image is rendered into its record. Observations: one more than steps in each flight.
+        /// A depth image is rendered into its record. Observations: one more than steps in each
+        /// episode.
         Camera => "camera",
         /// The image is encoded. Observations.
         Encoder => "encoder",
@@ -81,72 +73,73 @@ stages! {
         Policy => "policy",
         /// A record is loaned from shared memory, completed by reward and end, and sent. Records.
         Send => "send",
-        /// The learner is listened to, and given signs of life. Looks.
+        /// Messages of the learner are read, and heartbeats sent. Reads.
         ActorControl => "control",
-        /// There is no ticket, or its snapshot is not there yet. Waits.
+        /// No ticket, or no snapshot for it, is available. Waits.
         ActorIdle => "idle",
     }
     Receiving {
-        /// Records are checked, put together into flights, and delivered. Records.
+        /// Records are checked, assembled into episodes, and delivered. Records.
         Assemble => "assemble",
-        /// Orders are taken; tickets, snapshots and signs of life go out. Rounds.
+        /// Orders are received; tickets, snapshots and heartbeats are sent. Rounds.
         HandOut => "hand out",
-        /// Nobody has sent anything. Waits.
+        /// No record has arrived. Waits.
         ReceivingIdle => "idle",
     }
     Training {
-        /// Flights go into replay and metrics. Flights, legs.
+        /// Episodes are stored in replay and metrics. Episodes, segments.
         TakeIn => "take in",
         /// A minibatch of depth images is gathered. Minibatches.
         SampleImages => "sample images",
-        /// A step of the VAE. Steps.
+        /// An update of the VAE. Updates.
         VaeStep => "VAE step",
-        /// Stored codes are made anew by the trained VAE. Once.
+        /// Stored latent codes are recomputed with the present encoder: every `vae.recode_steps`
+        /// steps, and when the VAE is frozen. Times.
         Recode => "recode",
         /// A minibatch of transitions is gathered. Minibatches.
         Sample => "sample",
         /// An update of critic and policy. Updates.
         PolicyUpdate => "policy update",
-        /// The parameters are copied into a snapshot and handed over. Snapshots.
+        /// The parameters are copied into a snapshot and published. Snapshots.
         Publish => "publish",
-        /// Evaluation flights are waited for. Flights.
+        /// The trainer waits for evaluation episodes. Episodes.
         Evaluate => "evaluation",
-        /// The state is copied for a checkpoint and handed over. Checkpoints.
+        /// The state is copied for a checkpoint and handed to its writer. Checkpoints.
         Checkpoint => "checkpoint",
-        /// The start, orders, curves, the files at the end, waits that were broken off. Not counted.
+        /// Start, orders, curves, final files, interrupted waits. Not counted.
         OtherTraining => "other",
-        /// Training flights are waited for. Waits.
+        /// The trainer waits for training episodes. Waits.
         TrainingIdle => "idle",
     }
 }
 
 const STAGES: usize = Stage::ALL.len();
 
-/// The stages of an actor: the first of [`Stage::ALL`].
+/// Number of an actor's stages: the first of [`Stage::ALL`].
 pub const ACTOR_STAGES: usize = {
     let mut stages = 0;
-    while matches!(Stage::ALL[stages].thread(), Thread::Actors) {
+    while matches!(Stage::ALL[stages].thread(), ThreadRole::Actors) {
         stages += 1;
     }
     stages
 };
 
-/// Time, and what was done in it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable, ZeroCopySend)]
+/// Count and time of a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-pub struct Tally {
-    /// How often.
+pub struct StageTime {
+    /// Number of times.
     pub count: u64,
-    /// How long, in nanoseconds.
+    /// Nanoseconds.
     pub nanos: u64,
 }
 
-// Lies in shared memory: two 8-byte fields, no padding.
-const _: () = assert!(size_of::<Tally>() == 16);
+// Part of shared memory: two 8-byte fields, no padding.
+const _: () = assert!(size_of::<StageTime>() == 16);
 
-impl Tally {
-    /// More than any thread comes to: nine years, in nanoseconds.
-    const BEYOND: u64 = 1 << 58;
+impl StageTime {
+    /// Bound of valid values: nine years, in nanoseconds.
+    const LIMIT: u64 = 1 << 58;
 
     fn plus(self, other: Self) -> Self {
         Self {
@@ -162,88 +155,94 @@ impl Tally {
         }
     }
 
-    /// In seconds.
+    /// Returns the time in seconds.
     pub fn secs(self) -> f64 {
         self.nanos as f64 / 1e9
     }
 }
 
-/// What was spent on each stage.
+/// Count and time of every stage.
 ///
-/// Stored as a list, without stages that did not occur: `thread`, `stage`, `count`, `secs`. Stages of another version are left out when it is read.
+/// Stored as a list without stages that did not occur: `thread`, `stage`, `count`, `secs`. Unknown
+/// stages are ignored when it is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "Vec<Row>", into = "Vec<Row>")]
-pub struct Times([Tally; STAGES]);
+#[serde(from = "Vec<StageRow>", into = "Vec<StageRow>")]
+pub struct StageTimes([StageTime; STAGES]);
 
-impl Default for Times {
+impl Default for StageTimes {
     fn default() -> Self {
-        Self([Tally::default(); STAGES])
+        Self([StageTime::default(); STAGES])
     }
 }
 
-impl Times {
-    /// What was spent on `stage`.
-    pub fn of(&self, stage: Stage) -> Tally {
+impl StageTimes {
+    /// Returns count and time of `stage`.
+    pub fn of(&self, stage: Stage) -> StageTime {
         self.0[stage as usize]
     }
 
-    /// What `thread` has spent in all, in nanoseconds.
-    pub fn total_nanos(&self, thread: Thread) -> u64 {
+    /// Returns the total time of `thread` in nanoseconds.
+    pub fn total_nanos(&self, thread: ThreadRole) -> u64 {
         let own = Stage::ALL.iter().filter(|stage| stage.thread() == thread);
         own.fold(0, |sum, stage| sum.saturating_add(self.of(*stage).nanos))
     }
 
-    /// Adds to `stage`.
+    /// Adds `count` and `time` to `stage`.
     pub fn add(&mut self, stage: Stage, count: u64, time: Duration) {
         let nanos = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
         let tally = &mut self.0[stage as usize];
-        *tally = tally.plus(Tally { count, nanos });
+        *tally = tally.plus(StageTime { count, nanos });
     }
 
-    /// Both together.
+    /// Returns the sum of both.
     #[must_use]
     pub fn plus(&self, other: &Self) -> Self {
-        Self(std::array::from_fn(|stage| self.0[stage].plus(other.0[stage])))
+        Self(std::array::from_fn(|stage| {
+            self.0[stage].plus(other.0[stage])
+        }))
     }
 
-    /// What has come since `earlier`; nothing where that is more.
+    /// Returns the difference to `earlier`, zero where that is larger.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
-        Self(std::array::from_fn(|stage| self.0[stage].minus(earlier.0[stage])))
+        Self(std::array::from_fn(|stage| {
+            self.0[stage].minus(earlier.0[stage])
+        }))
     }
 
-    /// An actor's stages, on the wire.
-    pub(crate) fn of_actor(&self) -> [Tally; ACTOR_STAGES] {
+    /// Returns an actor's stages for the wire.
+    pub(crate) fn of_actor(&self) -> [StageTime; ACTOR_STAGES] {
         std::array::from_fn(|stage| self.0[stage])
     }
 
-    /// What an actor says of itself, or `None` when it cannot be.
-    pub(crate) fn read_actor(tallies: &[Tally; ACTOR_STAGES]) -> Option<Self> {
+    /// Reads an actor's report; returns `None` if a value is impossible.
+    pub(crate) fn read_actor(tallies: &[StageTime; ACTOR_STAGES]) -> Option<Self> {
         let mut times = Self::default();
         times.0[..ACTOR_STAGES].copy_from_slice(tallies);
-        let possible = |tally: &Tally| tally.count < Tally::BEYOND && tally.nanos < Tally::BEYOND;
+        let possible =
+            |tally: &StageTime| tally.count < StageTime::LIMIT && tally.nanos < StageTime::LIMIT;
         tallies.iter().all(possible).then_some(times)
     }
 
-    /// Stages that occurred.
-    fn occurred(&self) -> impl Iterator<Item = (Stage, Tally)> {
+    /// Returns the stages that occurred.
+    pub fn occurred(&self) -> impl Iterator<Item = (Stage, StageTime)> {
         let all = Stage::ALL.iter().map(|stage| (*stage, self.of(*stage)));
-        all.filter(|(_, tally)| *tally != Tally::default())
+        all.filter(|(_, tally)| *tally != StageTime::default())
     }
 }
 
-/// A stage of [`Times`] in a file.
+/// A stage of [`StageTimes`] in a file.
 #[derive(Serialize, Deserialize)]
-struct Row {
+struct StageRow {
     thread: String,
     stage: String,
     count: u64,
     secs: f64,
 }
 
-impl From<Times> for Vec<Row> {
-    fn from(times: Times) -> Self {
-        let row = |(stage, tally): (Stage, Tally)| Row {
+impl From<StageTimes> for Vec<StageRow> {
+    fn from(times: StageTimes) -> Self {
+        let row = |(stage, tally): (Stage, StageTime)| StageRow {
             thread: stage.thread().name().to_owned(),
             stage: stage.name().to_owned(),
             count: tally.count,
@@ -253,13 +252,14 @@ impl From<Times> for Vec<Row> {
     }
 }
 
-impl From<Vec<Row>> for Times {
-    fn from(rows: Vec<Row>) -> Self {
+impl From<Vec<StageRow>> for StageTimes {
+    fn from(rows: Vec<StageRow>) -> Self {
         let mut times = Self::default();
         for row in rows {
-            let is_of = |stage: &&Stage| stage.thread().name() == row.thread && stage.name() == row.stage;
+            let is_of =
+                |stage: &&Stage| stage.thread().name() == row.thread && stage.name() == row.stage;
             if let Some(stage) = Stage::ALL.iter().find(is_of) {
-                // Saturates: whatever a file says is a time.
+                // The cast saturates, so any number in a file becomes a time.
                 let nanos = (row.secs * 1e9).round() as u64;
                 times.add(*stage, row.count, Duration::from_nanos(nanos));
             }
@@ -268,75 +268,32 @@ impl From<Vec<Row>> for Times {
     }
 }
 
-/// A table: a row a stage, in the order of the data's way.
-impl fmt::Display for Times {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let mut table = Table::new();
-        table.load_preset(UTF8_FULL_CONDENSED);
-        table.set_header(["where the time went", "stage", "count", "total", "each", "share"]);
-        let mut thread = None;
-        for (stage, tally) in self.occurred() {
-            let of_thread = self.total_nanos(stage.thread());
-            let title = if thread.replace(stage.thread()) == Some(stage.thread()) {
-                ""
-            } else {
-                stage.thread().title()
-            };
-            table.add_row([
-                title.to_owned(),
-                stage.name().to_owned(),
-                some(tally.count, tally.count.to_string()),
-                format!("{:.2} s", tally.secs()),
-                some(tally.count, each(tally)),
-                format!("{:.1} %", 100.0 * tally.nanos as f64 / of_thread.max(1) as f64),
-            ]);
-        }
-        for column in table.column_iter_mut().skip(2) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-        write!(f, "{table}")
-    }
-}
-
-/// `text`, unless there is nothing to be counted.
-fn some(count: u64, text: String) -> String {
-    if count == 0 { String::new() } else { text }
-}
-
-fn each(tally: Tally) -> String {
-    let secs = tally.secs() / tally.count.max(1) as f64;
-    match secs {
-        0.0..1e-3 => format!("{:.2} µs", secs * 1e6),
-        1e-3..1.0 => format!("{:.2} ms", secs * 1e3),
-        _ => format!("{secs:.2} s"),
-    }
-}
-
-/// Books one thread's time, lap by lap.
+/// Measures one thread's time, lap by lap.
 #[derive(Debug, Clone)]
 pub struct LapTimer {
-    times: Times,
+    times: StageTimes,
     last: Instant,
 }
 
 impl LapTimer {
-    /// Runs from now on.
+    /// Starts the timer.
     pub fn start() -> Self {
         Self {
-            times: Times::default(),
+            times: StageTimes::default(),
             last: Instant::now(),
         }
     }
 
-    /// Books the time since the last lap to `stage`, in which `count` were done; 0 for a part of what is counted elsewhere.
+    /// Assigns the time since the last lap to `stage`, which was done `count` times. Use 0 for a
+    /// part that is counted in another lap.
     pub fn lap(&mut self, stage: Stage, count: u64) {
         let now = Instant::now();
         self.times.add(stage, count, now - self.last);
         self.last = now;
     }
 
-    /// All laps so far.
-    pub fn times(&self) -> &Times {
+    /// Returns the times of all laps so far.
+    pub fn times(&self) -> &StageTimes {
         &self.times
     }
 }

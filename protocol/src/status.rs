@@ -1,26 +1,25 @@
-//! What an actor tells the learner besides its flights: that it is there, and that it lives.
+//! The status of an actor: a heartbeat with its counters.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 
-use crate::ids::{ActorId, Incarnation, PolicyVersion, RunId};
-use crate::stages::{ACTOR_STAGES, Tally, Times};
+use crate::ids::{ActorId, ActorIncarnation, PolicyVersion, RunId};
+use crate::stages::{ACTOR_STAGES, StageTime, StageTimes};
 
-/// Sign of life of an actor, sent at its start, when it finds nothing to fly, at every heartbeat and at its end.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+/// Heartbeat of an actor on the wire. It is sent at the actor's start, when it finds no ticket to
+/// fly, at regular intervals, and at its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.StatusRecord.v2")]
 pub struct StatusRecord {
     run: u64,
     incarnation: u64,
     newest_policy: u64,
-    flights_flown: u64,
+    episodes_flown: u64,
     actor: u32,
     pid: u32,
     state: u32,
     reserved: u32,
-    /// By stage, in the order of [`crate::stages::Stage::ALL`].
-    times: [Tally; ACTOR_STAGES],
+    /// Times by stage, in the order of [`crate::stages::Stage::ALL`].
+    times: [StageTime; ACTOR_STAGES],
 }
 
 // Four 8-byte and four 4-byte fields, then tallies of two 8-byte fields: no padding.
@@ -31,39 +30,39 @@ const _: () = assert!(size_of::<StatusRecord>() == 4 * 8 + 4 * 4 + ACTOR_STAGES 
 pub struct ActorStatus {
     /// The actor.
     pub actor: ActorId,
-    /// Its life.
-    pub incarnation: Incarnation,
-    /// Its process.
+    /// Its incarnation.
+    pub incarnation: ActorIncarnation,
+    /// Process id.
     pub pid: u32,
-    /// What it is about.
+    /// State.
     pub state: ActorState,
-    /// The newest snapshot it holds, if any.
+    /// The newest snapshot that it holds, if any.
     pub newest_policy: Option<PolicyVersion>,
-    /// Flights it has flown in this life.
-    pub flights_flown: u64,
-    /// What its time in this life has gone into, until its last lap.
-    pub times: Times,
+    /// Episodes flown in this incarnation.
+    pub episodes_flown: u64,
+    /// Times of this incarnation, up to its last lap.
+    pub times: StageTimes,
 }
 
-/// What an actor is about.
+/// State of an actor.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ActorState {
-    /// Ready for tickets, or flying.
+    /// Accepts tickets, or flies one.
     Serving,
-    /// Takes no more tickets.
+    /// Accepts no more tickets.
     Leaving,
 }
 
 const NO_POLICY: u64 = u64::MAX;
 
 impl StatusRecord {
-    /// `status` on the wire.
+    /// Builds the record of `status`.
     pub fn new(run: RunId, status: &ActorStatus) -> Self {
         Self {
             run: run.0,
             incarnation: status.incarnation.0,
             newest_policy: status.newest_policy.map_or(NO_POLICY, |version| version.0),
-            flights_flown: status.flights_flown,
+            episodes_flown: status.episodes_flown,
             actor: status.actor.0,
             pid: status.pid,
             state: match status.state {
@@ -75,21 +74,23 @@ impl StatusRecord {
         }
     }
 
-    /// The status, or `None` when the record is of another run or holds what no actor of this version writes: another state, times of years.
+    /// Reads the status; returns `None` if the record is of another run, or holds what no actor of
+    /// this version writes (unknown state, times of years).
     pub fn read(&self, run: RunId) -> Option<ActorStatus> {
         let state = match self.state {
             1 => ActorState::Serving,
             2 => ActorState::Leaving,
             _ => return None,
         };
-        let times = Times::read_actor(&self.times)?;
+        let times = StageTimes::read_actor(&self.times)?;
         (self.run == run.0).then_some(ActorStatus {
             actor: ActorId(self.actor),
-            incarnation: Incarnation(self.incarnation),
+            incarnation: ActorIncarnation(self.incarnation),
             pid: self.pid,
             state,
-            newest_policy: (self.newest_policy != NO_POLICY).then_some(PolicyVersion(self.newest_policy)),
-            flights_flown: self.flights_flown,
+            newest_policy: (self.newest_policy != NO_POLICY)
+                .then_some(PolicyVersion(self.newest_policy)),
+            episodes_flown: self.episodes_flown,
             times,
         })
     }
@@ -107,11 +108,11 @@ mod tests {
         for newest_policy in [None, Some(PolicyVersion(4))] {
             let status = ActorStatus {
                 actor: ActorId(1),
-                incarnation: Incarnation(2),
+                incarnation: ActorIncarnation(2),
                 pid: 3,
                 state: ActorState::Leaving,
                 newest_policy,
-                flights_flown: 6,
+                episodes_flown: 6,
                 times: times(7),
             };
             let record = StatusRecord::new(RunId(9), &status);
@@ -121,23 +122,23 @@ mod tests {
         }
     }
 
-    fn times(nanos: u64) -> Times {
-        let mut times = Times::default();
+    fn times(nanos: u64) -> StageTimes {
+        let mut times = StageTimes::default();
         times.add(Stage::TakeSnapshot, 1, Duration::from_nanos(nanos));
         times.add(Stage::ActorIdle, nanos, Duration::from_nanos(2));
         times
     }
 
     #[test]
-    fn times_that_no_actor_comes_to_are_refused() {
+    fn impossible_times_are_refused() {
         let read = |times| {
             let status = ActorStatus {
                 actor: ActorId(1),
-                incarnation: Incarnation(2),
+                incarnation: ActorIncarnation(2),
                 pid: 3,
                 state: ActorState::Serving,
                 newest_policy: None,
-                flights_flown: 6,
+                episodes_flown: 6,
                 times,
             };
             StatusRecord::new(RunId(9), &status).read(RunId(9))

@@ -1,110 +1,126 @@
-//! `summary.json`: what a run came to.
+//! The summary of a run, `summary.json`.
 
 use std::collections::BTreeMap;
-use std::io;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use crate::durable;
+use crate::config::Config;
 use crate::ids::{PolicyVersion, RunId};
-use crate::run::RunDirectory;
-use crate::stages::Times;
+use crate::stages::StageTimes;
 
-/// What a run came to.
+/// Summary of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Version of Skein, and the last commit that changed what the learner is made of, where that is known: `0.1.0+b8735651a2c3`, with `-dirty` behind it if it had been changed since.
+    /// Version of Skein and, if known, the last commit that changed the learner:
+    /// `0.1.0+b8735651a2c3`, with `-dirty` appended if the code was modified.
     pub skein_version: String,
     /// The run.
     pub run: RunId,
     /// Its seed.
     pub seed: u64,
-    /// How it ended.
-    pub ending: Ending,
-    /// SHA-256 of the final encoder and policy parameters: equal exactly when two runs learned the same, bit for bit.
+    /// Its ending.
+    pub ending: RunEnding,
+    /// SHA-256 of the final encoder and policy parameters: equal exactly if two runs learned
+    /// bit-equal policies.
     pub policy_sha256: String,
     /// The final snapshot.
     pub final_version: PolicyVersion,
     /// The best snapshot, if one was confirmed.
     pub best_version: Option<PolicyVersion>,
-    /// Walls passed in the best snapshot's confirmation flights, on average.
+    /// Mean walls passed in the best snapshot's confirmation episodes.
     pub best_confirmed_walls_passed: Option<f64>,
-    /// When a candidate for the best snapshot first passed the share `evaluation.trained_rate` of walls, if one did.
+    /// First time that a candidate for the best snapshot passed the share `evaluation.trained_rate`
+    /// of walls, if one did.
     #[serde(default)]
     pub trained: Option<Trained>,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Environment steps of training flights.
+    /// Reason why the policy is untrained and the remedy, if no update was made.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub untrained: Option<String>,
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Environment steps of training episodes.
     pub steps: u64,
     /// Updates of the agent, SAC or TD3.
     pub updates: u64,
-    /// VAE steps.
+    /// VAE updates.
     pub vae_updates: u64,
-    /// Flights without exploration: those that the best snapshot was chosen by, and those of its evaluation. Their steps are in no other count.
-    pub evaluation_flights: u64,
-    /// Tickets issued again, for whatever reason.
+    /// Episodes without exploration: confirmation episodes and those of the final evaluation. Their
+    /// steps are not in any other count.
+    pub evaluation_episodes: u64,
+    /// Tickets issued again, for any reason.
     pub tickets_reissued: u64,
     /// Records that were refused.
     pub records_refused: u64,
-    /// [`Summary::tickets_reissued`] by reason; without reasons that did not occur.
+    /// [`Summary::tickets_reissued`] by reason; reasons that did not occur
+    /// are left out.
     #[serde(default)]
     pub reissued_by_reason: BTreeMap<String, u64>,
-    /// [`Summary::records_refused`] by reason; without reasons that did not occur.
+    /// [`Summary::records_refused`] by reason; reasons that did not occur
+    /// are left out.
     #[serde(default)]
     pub refused_by_reason: BTreeMap<String, u64>,
-    /// Times the learner was started again, whether it went on from a checkpoint or from the first flight.
+    /// Restarts of the learner, from a checkpoint or from the first episode.
     #[serde(default)]
     pub resumes: u64,
-    /// Seconds from the learner's start to its end, over all its lives; what a death undid is not counted.
+    /// Seconds from the learner's start to its end, over all its incarnations, without work that a
+    /// death undid.
     pub wall_secs: f64,
-    /// What the time of actors and learner went into, as far as `wall_secs`. An actor that was killed has told of it until its last heartbeat or the end of
-    /// its last flight, whichever was later.
+    /// Time of actors and learner by stage, up to `wall_secs`. For a killed actor it ends at its
+    /// last heartbeat or the end of its last episode, whichever was later.
     #[serde(default)]
-    pub stages: Times,
-    /// Seconds of processor time in the learner's last life by those of its threads that lived until its end; `reception` receives and assembles flights.
+    pub stages: StageTimes,
+    /// Processor seconds of the learner's last incarnation, by thread, for the threads that lived
+    /// until its end; `receiver` receives and assembles episodes.
     #[serde(default)]
     pub thread_cpu_secs: BTreeMap<String, f64>,
 }
 
 impl Summary {
-    /// That of `run`; `None` if it has none, or none that can be read.
-    pub fn of(run: &RunDirectory) -> Option<Self> {
-        serde_json::from_slice(&std::fs::read(run.summary_json()).ok()?).ok()
+    /// Returns `true` if the run completed all episodes of `config`. One that was lengthened
+    /// afterwards has more to fly.
+    pub fn is_of_whole(&self, config: &Config) -> bool {
+        self.ending == RunEnding::Completed && self.episodes >= config.run.episodes
     }
 
-    /// Puts it at `path`, at once or not at all.
-    ///
-    /// # Errors
-    /// Of the file system.
-    pub fn save(&self, path: &Path) -> io::Result<()> {
-        let json = serde_json::to_string_pretty(self).map_err(io::Error::other)?;
-        durable::replace(path, json.as_bytes())
+    /// Reads the summary at `path`; returns `None` if there is none, or it cannot be read.
+    pub fn load(path: &Path) -> Option<Self> {
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    }
+
+    /// Returns the summary as JSON, for its file.
+    pub fn to_json(&self) -> String {
+        serde_json::to_string_pretty(self).expect("a summary is plain data")
     }
 }
 
-/// When a policy first did what it was trained for: what is behind it then.
+/// Counters at the time that a policy first counted as trained.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Trained {
-    /// Share R of walls passed in its evaluation flights, without exploration noise, from the start of level 1, where `evaluation.confirm_on` says.
+    /// Share R of walls passed in its confirmation episodes (without exploration noise, from the
+    /// start of level 1, on the courses of `evaluation.confirm_on`).
     pub rate: f64,
-    /// Training flights committed.
-    pub flights: u64,
-    /// Environment steps of training flights.
+    /// Number of these confirmation episodes; 0 where it was not recorded.
+    #[serde(default)]
+    pub confirmation_episodes: u64,
+    /// Training episodes committed.
+    pub episodes: u64,
+    /// Environment steps of training episodes.
     pub steps: u64,
     /// Policy updates.
     pub updates: u64,
-    /// Seconds from the learner's start until its evaluation flights were flown, over all lives; what a death undid is not counted.
+    /// Seconds from the learner's start until its confirmation episodes were flown, over all
+    /// incarnations, without work that a death undid.
     pub wall_secs: f64,
 }
 
-/// How a run ended.
+/// Ending of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Ending {
-    /// All flights were flown.
+pub enum RunEnding {
+    /// All episodes were flown.
     Completed,
-    /// It was told to stop.
+    /// The run was interrupted.
     Interrupted,
 }
 
@@ -118,32 +134,33 @@ mod tests {
     #[test]
     fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
         let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
-        let path = run.summary_json();
-        assert_eq!(Summary::of(&run), None);
-        let mut stages = Times::default();
+        let path = directory.path().join("summary.json");
+        assert_eq!(Summary::load(&path), None);
+        let mut stages = StageTimes::default();
         stages.add(Stage::Publish, 3, Duration::from_millis(500));
         let summary = Summary {
             skein_version: "0.1.0".to_owned(),
             run: RunId(3),
             seed: 1,
-            ending: Ending::Completed,
+            ending: RunEnding::Completed,
             policy_sha256: "ab".to_owned(),
             final_version: PolicyVersion(4),
             best_version: None,
             best_confirmed_walls_passed: None,
             trained: Some(Trained {
                 rate: 0.95,
-                flights: 30,
+                confirmation_episodes: 20,
+                episodes: 30,
                 steps: 300,
                 updates: 15,
                 wall_secs: 1.25,
             }),
-            flights: 40,
+            untrained: None,
+            episodes: 40,
             steps: 400,
             updates: 20,
             vae_updates: 10,
-            evaluation_flights: 6,
+            evaluation_episodes: 6,
             tickets_reissued: 0,
             records_refused: 0,
             reissued_by_reason: BTreeMap::new(),
@@ -151,22 +168,24 @@ mod tests {
             resumes: 2,
             wall_secs: 1.5,
             stages,
-            thread_cpu_secs: BTreeMap::from([("reception".to_owned(), 0.25)]),
+            thread_cpu_secs: BTreeMap::from([("receiver".to_owned(), 0.25)]),
         };
-        summary.save(&path).unwrap();
-        assert_eq!(Summary::of(&run), Some(summary));
+        std::fs::write(&path, summary.to_json()).unwrap();
+        assert_eq!(Summary::load(&path), Some(summary));
         std::fs::write(&path, "{").unwrap();
-        assert_eq!(Summary::of(&run), None);
+        assert_eq!(Summary::load(&path), None);
     }
 
     #[test]
-    fn a_summary_from_before_there_were_stages_is_read() {
+    fn a_summary_without_optional_fields_is_read() {
         let directory = tempfile::tempdir().unwrap();
-        let run = RunDirectory::new(directory.path());
-        let old = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"ab","final_version":80,"best_version":70,
-            "best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,"evaluation_flights":400,
-            "tickets_reissued":0,"records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
-        std::fs::write(run.summary_json(), old).unwrap();
-        assert_eq!(Summary::of(&run).unwrap().stages, Times::default());
+        let path = directory.path().join("summary.json");
+        let short = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed",
+            "policy_sha256":"ab","final_version":80,"best_version":70,
+            "best_confirmed_walls_passed":4.9,"episodes":800,"steps":42837,"updates":20418,
+            "vae_updates":400,"evaluation_episodes":400,"tickets_reissued":0,
+            "records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
+        std::fs::write(&path, short).unwrap();
+        assert_eq!(Summary::load(&path).unwrap().stages, StageTimes::default());
     }
 }

@@ -1,46 +1,48 @@
-//! The ticket: everything a flight is a function of.
+//! The ticket: the complete input of an episode.
 //!
-//! A flight is flown only against a ticket, and two actors that hold the same ticket fly the same flight, bit for bit. The learner sends tickets inside
-//! [`ControlRecord`]s, fixed-size messages that actors listen to; those of [legs](crate::leg) inside [`LegRecord`]s, which have room for more.
+//! An episode is flown only for a ticket, and two actors with the same ticket fly the same episode,
+//! bit for bit. The learner sends tickets inside [`ControlRecord`]s, messages of fixed size;
+//! tickets of [segments](crate::segment) inside [`SegmentRecord`]s, which have more room.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ActorId, Attempt, FlightId, Incarnation, PolicyVersion, RunId};
-use crate::leg::{Leg, LegRecord};
+use crate::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, PolicyVersion, RunId};
+use crate::segment::{Segment, SegmentRecord};
 
-/// What a flight is flown for, how, where and with which policy.
+/// Ticket of an episode: its course, policy, exploration and seed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ticket {
     /// The run it belongs to.
     pub run: RunId,
     /// Its number.
-    pub flight: FlightId,
-    /// How often this flight had been issued before.
+    pub episode: EpisodeId,
+    /// Number of earlier attempts at this episode.
     pub attempt: Attempt,
-    /// The snapshot to hold for all that the ticket is for.
+    /// The snapshot to fly the whole ticket with.
     pub policy_version: PolicyVersion,
-    /// Where it is flown.
+    /// Course.
     pub course: CourseChoice,
-    /// The level (1 is the first) whose start it takes off from.
+    /// The level whose start the episode begins at, from 1.
     pub start_level: u8,
-    /// How actions are chosen.
+    /// Choice of actions.
     pub exploration: Exploration,
-    /// Seed of everything random in the flight.
+    /// Seed of everything random in the episode.
     pub seed: u64,
-    /// The part of the flight to fly; `None` for all of it.
-    pub leg: Option<Leg>,
+    /// The part of the episode to fly; `None` for all of it.
+    pub segment: Option<Segment>,
 }
 
 impl Ticket {
-    /// Steps of the flight that were flown on other tickets before.
+    /// Returns the number of steps flown on earlier tickets of this episode.
     pub fn first_step(&self) -> u32 {
-        self.leg.as_ref().map_or(0, |leg| leg.flown.len() as u32)
+        self.segment
+            .as_ref()
+            .map_or(0, |segment| segment.prior_actions.len() as u32)
     }
 }
 
-/// Where a flight is flown.
+/// Course of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum CourseChoice {
     /// The training course.
@@ -51,7 +53,7 @@ pub enum CourseChoice {
     Generated(u64),
 }
 
-/// How actions are chosen.
+/// Choice of actions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Exploration {
     /// Uniformly at random, before the first update.
@@ -62,27 +64,26 @@ pub enum Exploration {
     Mode,
 }
 
-/// What the learner tells an actor.
+/// Message from the learner to an actor.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Control {
-    /// Fly this.
+    /// Fly this ticket.
     Fly(Ticket),
     /// The learner is alive.
     Heartbeat,
     /// The run is over: stop flying and exit.
     Stop,
-    /// Nothing of what this actor flies arrives: join anew.
+    /// No record of this actor arrives: join again.
     Rejoin,
 }
 
 /// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.ControlRecord.v1")]
 pub struct ControlRecord {
     run: u64,
     to_incarnation: u64,
-    flight: u64,
+    episode: u64,
     policy_version: u64,
     course_seed: u64,
     seed: u64,
@@ -95,14 +96,15 @@ pub struct ControlRecord {
     exploration: u8,
 }
 
-// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever leaves the process.
+// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever
+// leaves the process.
 const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
 
-const EVERYONE: u32 = u32::MAX;
+const ALL_ACTORS: u32 = u32::MAX;
 
 impl ControlRecord {
-    /// `ticket` for all of its flight, for one life of one actor.
-    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// Builds the record of `ticket` for a whole episode, for one incarnation of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         let (course_kind, course_index, course_seed) = match ticket.course {
             CourseChoice::Training => (0, 0, 0),
             CourseChoice::Evaluation(index) => (1, index, 0),
@@ -111,7 +113,7 @@ impl ControlRecord {
         Self {
             run: ticket.run.0,
             to_incarnation: incarnation.0,
-            flight: ticket.flight.0,
+            episode: ticket.episode.0,
             policy_version: ticket.policy_version.0,
             course_seed,
             seed: ticket.seed,
@@ -129,34 +131,34 @@ impl ControlRecord {
         }
     }
 
-    /// A sign of life to all actors.
+    /// Builds a heartbeat to all actors.
     pub fn heartbeat(run: RunId) -> Self {
-        Self::to_everyone(run, 0)
+        Self::broadcast(run, 0)
     }
 
-    /// The end of the run, to all actors.
+    /// Builds the end of the run, to all actors.
     pub fn stop(run: RunId) -> Self {
-        Self::to_everyone(run, 2)
+        Self::broadcast(run, 2)
     }
 
-    /// The request to one life of one actor to join anew.
-    pub fn rejoin(run: RunId, actor: ActorId, incarnation: Incarnation) -> Self {
+    /// Builds the request to one incarnation of one actor to join again.
+    pub fn rejoin(run: RunId, actor: ActorId, incarnation: ActorIncarnation) -> Self {
         Self {
             to_actor: actor.0,
             to_incarnation: incarnation.0,
-            ..Self::to_everyone(run, 3)
+            ..Self::broadcast(run, 3)
         }
     }
 
-    fn to_everyone(run: RunId, kind: u8) -> Self {
+    fn broadcast(run: RunId, kind: u8) -> Self {
         Self {
             run: run.0,
             to_incarnation: 0,
-            flight: 0,
+            episode: 0,
             policy_version: 0,
             course_seed: 0,
             seed: 0,
-            to_actor: EVERYONE,
+            to_actor: ALL_ACTORS,
             attempt: 0,
             course_index: 0,
             kind,
@@ -166,15 +168,16 @@ impl ControlRecord {
         }
     }
 
-    /// Whether this life of this actor is meant.
-    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
-        self.to_actor == EVERYONE || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
+    /// Returns `true` if the message is for this incarnation of this actor.
+    pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
+        self.to_actor == ALL_ACTORS
+            || (self.to_actor == actor.0 && self.to_incarnation == incarnation.0)
     }
 
-    /// What is said.
+    /// Reads the message.
     ///
     /// # Errors
-    /// [`ControlFault`] when the record holds what no learner of this version and run writes.
+    /// [`ControlFault`] if the record holds what no learner of this version and run writes.
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         if self.run != run.0 {
             return Err(ControlFault::OtherRun(self.run));
@@ -200,7 +203,7 @@ impl ControlRecord {
         }
         Ok(Ticket {
             run,
-            flight: FlightId(self.flight),
+            episode: EpisodeId(self.episode),
             attempt: Attempt(self.attempt),
             policy_version: PolicyVersion(self.policy_version),
             course: match self.course_kind {
@@ -227,56 +230,61 @@ impl ControlRecord {
                 }
             },
             seed: self.seed,
-            leg: None,
+            segment: None,
         })
     }
 }
 
-/// A message to actors, for the service that has room for it.
+/// A message to actors, by the service that carries it.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Message {
-    /// Everything but tickets of legs.
+pub enum ControlMessage {
+    /// Everything except tickets of segments.
     Control(ControlRecord),
-    /// The ticket of a leg.
-    Leg(Box<LegRecord>),
+    /// The ticket of a segment.
+    Segment(Box<SegmentRecord>),
 }
 
-impl Message {
-    /// `ticket`, for one life of one actor.
-    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: Incarnation) -> Self {
-        match &ticket.leg {
+impl ControlMessage {
+    /// Builds the message with `ticket`, for one incarnation of one actor.
+    pub fn fly(ticket: &Ticket, actor: ActorId, incarnation: ActorIncarnation) -> Self {
+        match &ticket.segment {
             None => Self::Control(ControlRecord::fly(ticket, actor, incarnation)),
-            Some(leg) => Self::Leg(Box::new(LegRecord::fly(ticket, leg, actor, incarnation))),
+            Some(segment) => Self::Segment(Box::new(SegmentRecord::fly(
+                ticket,
+                segment,
+                actor,
+                incarnation,
+            ))),
         }
     }
 
-    /// Whether this life of this actor is meant.
-    pub fn is_for(&self, actor: ActorId, incarnation: Incarnation) -> bool {
+    /// Returns `true` if the message is for this incarnation of this actor.
+    pub fn is_for(&self, actor: ActorId, incarnation: ActorIncarnation) -> bool {
         match self {
             Self::Control(record) => record.is_for(actor, incarnation),
-            Self::Leg(record) => record.is_for(actor, incarnation),
+            Self::Segment(record) => record.is_for(actor, incarnation),
         }
     }
 
-    /// What is said.
+    /// Reads the message.
     ///
     /// # Errors
-    /// [`ControlFault`] when the message holds what no learner of this version and run writes.
+    /// [`ControlFault`] if the message holds what no learner of this version and run writes.
     pub fn read(&self, run: RunId) -> Result<Control, ControlFault> {
         match self {
             Self::Control(record) => record.read(run),
-            Self::Leg(record) => record.read(run),
+            Self::Segment(record) => record.read(run),
         }
     }
 }
 
-/// Why a control record is not believed.
+/// Reason why a control record is refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum ControlFault {
-    /// It belongs to another run.
+    /// The record belongs to another run.
     #[error("control record of run {0:016x}")]
     OtherRun(u64),
-    /// A field has a value this version does not know.
+    /// A field has an unknown value.
     #[error("control record with {name} = {value}")]
     Field {
         /// The field.
@@ -284,9 +292,9 @@ pub enum ControlFault {
         /// Its value.
         value: u8,
     },
-    /// The ticket of a leg makes no sense.
-    #[error("the ticket of a leg {0}")]
-    Leg(&'static str),
+    /// The ticket of a segment is invalid.
+    #[error("the ticket of a segment {0}")]
+    Segment(&'static str),
 }
 
 #[cfg(test)]
@@ -296,14 +304,14 @@ pub(crate) mod tests {
     pub(crate) fn ticket() -> Ticket {
         Ticket {
             run: RunId(3),
-            flight: FlightId(7),
+            episode: EpisodeId(7),
             attempt: Attempt(1),
             policy_version: PolicyVersion(5),
             course: CourseChoice::Generated(99),
             start_level: 2,
             exploration: Exploration::Sample,
             seed: 42,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -321,26 +329,29 @@ pub(crate) mod tests {
                 exploration,
                 ..ticket()
             };
-            let record = ControlRecord::fly(&ticket, ActorId(4), Incarnation(8));
+            let record = ControlRecord::fly(&ticket, ActorId(4), ActorIncarnation(8));
             assert_eq!(record.read(RunId(3)), Ok(Control::Fly(ticket)));
         }
     }
 
     #[test]
-    fn a_ticket_is_for_one_life_of_one_actor() {
-        let record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
-        assert!(record.is_for(ActorId(4), Incarnation(8)));
-        assert!(!record.is_for(ActorId(4), Incarnation(9)));
-        assert!(!record.is_for(ActorId(5), Incarnation(8)));
-        assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), Incarnation(1)));
-        let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), Incarnation(8));
+    fn a_ticket_is_for_one_incarnation_of_one_actor() {
+        let record = ControlRecord::fly(&ticket(), ActorId(4), ActorIncarnation(8));
+        assert!(record.is_for(ActorId(4), ActorIncarnation(8)));
+        assert!(!record.is_for(ActorId(4), ActorIncarnation(9)));
+        assert!(!record.is_for(ActorId(5), ActorIncarnation(8)));
+        assert!(ControlRecord::stop(RunId(3)).is_for(ActorId(5), ActorIncarnation(1)));
+        let rejoin = ControlRecord::rejoin(RunId(3), ActorId(4), ActorIncarnation(8));
         assert_eq!(rejoin.read(RunId(3)), Ok(Control::Rejoin));
-        assert!(rejoin.is_for(ActorId(4), Incarnation(8)) && !rejoin.is_for(ActorId(4), Incarnation(9)));
+        assert!(
+            rejoin.is_for(ActorId(4), ActorIncarnation(8))
+                && !rejoin.is_for(ActorId(4), ActorIncarnation(9))
+        );
     }
 
     #[test]
     fn garbage_is_refused_with_the_field() {
-        let mut record = ControlRecord::fly(&ticket(), ActorId(4), Incarnation(8));
+        let mut record = ControlRecord::fly(&ticket(), ActorId(4), ActorIncarnation(8));
         assert_eq!(record.read(RunId(4)), Err(ControlFault::OtherRun(3)));
         record.exploration = 77;
         assert_eq!(

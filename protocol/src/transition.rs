@@ -1,45 +1,53 @@
-//! The transition record: one step of a flight, as it lies in shared memory.
+//! The transition record: one step of an episode, as it lies in shared memory.
 //!
-//! A flight of T steps is T+1 records, and so is a leg of one. Record t holds the observation at step t, the action chosen on it, and the reward and end flags that
-//! followed; the closing record holds the last observation only. The depth camera renders into [`TransitionRecord::depth`] of a loaned sample, and the learner reads
-//! it there: the image's bytes are written once.
+//! An episode or segment of T steps is T+1 records. Record t holds the observation at step t, the
+//! action chosen on it, and the reward and end flags that followed; the closing record holds only
+//! the last observation. The depth camera renders into [`TransitionRecord::depth`] of a loaned
+//! sample, and the learner reads it there: the image's bytes are written once.
 
 use bytemuck::{Pod, Zeroable};
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
 
-use crate::ids::{ActorId, Incarnation};
+use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
-use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode};
+use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
 
-/// No number of a sound record is larger: rewards end at 4 · 10⁶ by their settings, corridors at 1 km. The learner squares what it learns from, and single
-/// precision ends at 3 · 10³⁸.
-pub const LARGEST_NUMBER: f32 = 1e7;
+/// Largest magnitude in a valid record: the settings limit each term of a reward to 10⁶ and
+/// corridors to 1 km. The learner squares its inputs, and single precision ends at 3 · 10³⁸.
+pub const MAX_MAGNITUDE: f32 = 1e7;
 
-/// One step of a flight on the wire. Every bit pattern is a valid value of every field's type; [`TransitionRecord::check`] says whether it makes sense.
-#[derive(Debug, Clone, Copy, Pod, Zeroable, ZeroCopySend)]
+/// Bytes between `hit_wall` and `ground_truth`, so that the image starts on a cache line.
+const RESERVED: usize = {
+    // 361: the header's other fields.
+    let used = size_of::<f32>() * REWARD_TERMS + 361;
+    used.next_multiple_of(64) - used
+};
+
+/// One step of an episode on the wire. Every bit pattern is a valid value of every field's type;
+/// [`TransitionRecord::check`] checks the meaning.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-#[type_name("skein.TransitionRecord.v4")]
 pub struct TransitionRecord {
     /// The run.
     pub run: u64,
-    /// The flight.
-    pub flight: u64,
-    /// The snapshot that all of the ticket is flown with.
+    /// The episode.
+    pub episode: u64,
+    /// The snapshot that the whole ticket is flown with.
     pub policy_version: u64,
-    /// The actor's life.
+    /// The actor's incarnation.
     pub incarnation: u64,
     /// The actor.
     pub actor: u32,
-    /// The ticket's attempt: tells a flight flown again from its late twin.
+    /// The ticket's attempt. It distinguishes an episode flown again from a late copy.
     pub attempt: u32,
-    /// Position in the flight, from 0 without a gap, legs flown before included; the closing record counts too.
+    /// Step within the episode, from 0 without a gap. Earlier segments and the closing record
+    /// count.
     pub step: u32,
     /// A [`RecordKind`].
     pub kind: u8,
-    /// The level the flight took off from.
+    /// The level whose start the episode begins at.
     pub start_level: u8,
-    /// Walls passed in the flight so far, this step's included.
+    /// Walls passed in the episode so far, this step included.
     pub walls_passed: u8,
     /// An [`Outcome`], in the closing record.
     pub outcome: u8,
@@ -49,63 +57,69 @@ pub struct TransitionRecord {
     pub orientation: [f32; 4],
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
-    /// The VAE's latent mean of `depth`; zero from `vae.latent` on.
+    /// The VAE's latent mean of `depth`; zero from index `vae.latent` on.
     pub latent: LatentCode,
     /// Lateral and vertical velocity command, each in [-1, 1].
     pub action: [f32; ACTION],
     /// Sum of `reward_terms`.
     pub reward: f32,
-    /// The paper's four terms: collision, level-up, destination, action.
-    pub reward_terms: [f32; 4],
-    /// 1 when a wall was crossed or the destination reached in this step.
+    /// The terms of the reward: [`REWARD_TERM_NAMES`](crate::REWARD_TERM_NAMES).
+    pub reward_terms: [f32; REWARD_TERMS],
+    /// 1 if a wall was crossed or the destination reached in this step.
     pub level_up: u8,
-    /// 1 when the flight ended in this step in a state without a future (collision, destination).
+    /// 1 if the episode ended in this step in a state without a future (collision, destination).
     pub terminated: u8,
-    /// 1 when the flight was cut off in this step by its step limit; its value still bootstraps.
+    /// 1 if the step limit ended the episode in this step; its value still bootstraps.
     pub truncated: u8,
-    /// Walls of the course, in the closing record: what `walls_passed` is measured against.
+    /// Walls of the course, in the closing record: the maximum of `walls_passed`.
     pub course_walls: u8,
-    /// In the closing record of a flight that collided: the wall that was hit, from 1 in flight order, or 0 for the corridor. 0 in all others.
+    /// The wall that was hit, from 1 in course order, in the closing record of an episode that
+    /// collided; 0 for the corridor and in all other records.
     pub hit_wall: u8,
-    reserved: [u8; 7],
-    /// What the simulator knows of the observation's moment and the camera does not see; see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
+    reserved: [u8; RESERVED],
+    /// The simulator's ground truth at the time of the observation, which the camera does not see;
+    /// see [`CriticInput::GroundTruth`](crate::config::CriticInput::GroundTruth).
     pub ground_truth: [f32; GROUND_TRUTH],
-    /// The depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. On a cache line of its own.
+    /// Depth image, 128×72, row by row from the top left; 255 is the camera's range or farther. It
+    /// starts on a cache line.
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is seven cache lines, so that in samples aligned to one (see `services`) the image starts on one; nothing is padding, so that the record is plain data.
-const _: () = assert!(std::mem::offset_of!(TransitionRecord, depth) == 448);
-const _: () = assert!(size_of::<TransitionRecord>() == 448 + IMAGE_PIXELS);
+// The header is whole cache lines (seven for four terms of the reward), so the image starts on a
+// cache line in samples aligned to one (see `services`). There is no padding, so the record is
+// plain data.
+const HEADER: usize = std::mem::offset_of!(TransitionRecord, depth);
+const _: () = assert!(HEADER.is_multiple_of(64));
+const _: () = assert!(size_of::<TransitionRecord>() == HEADER + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
 
-/// What a record is within its flight.
+/// Role of a record within its episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RecordKind {
-    /// An observation, the action on it and what followed.
+    /// An observation, the action on it and the consequences.
     Step,
-    /// The last observation; ends the flight.
+    /// The last observation of an episode.
     Closing,
-    /// The last observation of a leg whose flight goes on.
-    LegEnd,
-    /// The flight broke off by a fault in the simulator; what was sent of it is void.
+    /// The last observation of a segment whose episode continues.
+    SegmentEnd,
+    /// The simulator failed; the episode's earlier records are void.
     Failed,
 }
 
-/// How a flight ended.
+/// Outcome of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// Touched a wall or the corridor.
     Collided,
-    /// Touched the end wall: the course is passed.
+    /// Reached the end wall: the course is passed.
     ReachedEnd,
-    /// Reached the step limit in the air.
+    /// Reached the step limit while flying.
     TimedOut,
 }
 
 impl Outcome {
-    /// As on the wire.
+    /// Returns the code on the wire.
     pub fn code(self) -> u8 {
         match self {
             Self::Collided => 1,
@@ -114,14 +128,14 @@ impl Outcome {
         }
     }
 
-    /// From the wire; `None` for what is no outcome.
+    /// Reads a code from the wire; returns `None` if it is not an outcome.
     pub fn from_code(code: u8) -> Option<Self> {
         [Self::Collided, Self::ReachedEnd, Self::TimedOut]
             .into_iter()
             .find(|outcome| outcome.code() == code)
     }
 
-    /// As in `flights.csv`.
+    /// Returns the name in `episodes.csv`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Collided => "collided",
@@ -132,30 +146,37 @@ impl Outcome {
 }
 
 impl RecordKind {
-    /// As on the wire.
+    /// Returns the code on the wire.
     pub fn code(self) -> u8 {
         match self {
             Self::Step => 1,
             Self::Closing => 2,
             Self::Failed => 3,
-            Self::LegEnd => 4,
+            Self::SegmentEnd => 4,
         }
     }
 
-    /// From the wire; `None` for what is no kind.
+    /// Reads a code from the wire; returns `None` if it is not a kind.
     pub fn from_code(code: u8) -> Option<Self> {
-        [Self::Step, Self::Closing, Self::Failed, Self::LegEnd]
+        [Self::Step, Self::Closing, Self::Failed, Self::SegmentEnd]
             .into_iter()
             .find(|kind| kind.code() == code)
     }
 }
 
 impl TransitionRecord {
-    /// Writes who flies what; everything but the image is reset. The image is left as it is, to be rendered over.
-    pub fn begin(&mut self, ticket: &Ticket, actor: ActorId, incarnation: Incarnation, step: u32) {
+    /// Writes the header for `step` of `ticket` and clears everything else except the image, which
+    /// is rendered over.
+    pub fn begin(
+        &mut self,
+        ticket: &Ticket,
+        actor: ActorId,
+        incarnation: ActorIncarnation,
+        step: u32,
+    ) {
         bytemuck::bytes_of_mut(self)[..std::mem::offset_of!(Self, depth)].fill(0);
         self.run = ticket.run.0;
-        self.flight = ticket.flight.0;
+        self.episode = ticket.episode.0;
         self.policy_version = ticket.policy_version.0;
         self.incarnation = incarnation.0;
         self.actor = actor.0;
@@ -165,7 +186,8 @@ impl TransitionRecord {
         self.start_level = ticket.start_level;
     }
 
-    /// The record's kind, if it makes sense as step `step` of `ticket` flown by `incarnation` of `actor`.
+    /// Returns the record's kind if it is valid as step `step` of `ticket` flown by `incarnation`
+    /// of `actor`.
     ///
     /// # Errors
     /// [`RecordFault`] names the field; such a record is never learned from.
@@ -173,23 +195,35 @@ impl TransitionRecord {
         &self,
         ticket: &Ticket,
         actor: ActorId,
-        incarnation: Incarnation,
+        incarnation: ActorIncarnation,
         step: u32,
     ) -> Result<RecordKind, RecordFault> {
         let same = |name, found: u64, expected: u64| {
             if found == expected {
                 Ok(())
             } else {
-                Err(RecordFault::Mismatch { name, found, expected })
+                Err(RecordFault::Mismatch {
+                    name,
+                    found,
+                    expected,
+                })
             }
         };
         same("run", self.run, ticket.run.0)?;
-        same("flight", self.flight, ticket.flight.0)?;
-        same("policy_version", self.policy_version, ticket.policy_version.0)?;
+        same("episode", self.episode, ticket.episode.0)?;
+        same(
+            "policy_version",
+            self.policy_version,
+            ticket.policy_version.0,
+        )?;
         same("attempt", self.attempt.into(), ticket.attempt.0.into())?;
         same("actor", self.actor.into(), actor.0.into())?;
         same("incarnation", self.incarnation, incarnation.0)?;
-        same("start_level", self.start_level.into(), ticket.start_level.into())?;
+        same(
+            "start_level",
+            self.start_level.into(),
+            ticket.start_level.into(),
+        )?;
         same("step", self.step.into(), step.into())?;
         let kind = RecordKind::from_code(self.kind).ok_or(RecordFault::Code {
             name: "kind",
@@ -204,7 +238,7 @@ impl TransitionRecord {
         Ok(kind)
     }
 
-    /// Whether the latent code is not longer than `latent` numbers.
+    /// Checks that the latent code is not longer than `latent` numbers.
     ///
     /// # Errors
     /// [`RecordFault::Contradiction`]; such a record was made with another encoder.
@@ -218,11 +252,15 @@ impl TransitionRecord {
     }
 
     fn check_numbers(&self) -> Result<(), RecordFault> {
-        let usual = -LARGEST_NUMBER..=LARGEST_NUMBER;
-        // A NaN is in no range.
-        let finite = |name, values: &[f32]| match values.iter().find(|value| !usual.contains(value)) {
+        let range = -MAX_MAGNITUDE..=MAX_MAGNITUDE;
+        // NaN is outside every range.
+        let finite = |name, values: &[f32]| match values.iter().find(|value| !range.contains(value))
+        {
             None => Ok(()),
-            Some(value) if value.is_finite() => Err(RecordFault::TooLarge { name, value: *value }),
+            Some(value) if value.is_finite() => Err(RecordFault::TooLarge {
+                name,
+                value: *value,
+            }),
             Some(_) => Err(RecordFault::NotFinite { name }),
         };
         finite("position_m", &self.position_m)?;
@@ -233,15 +271,17 @@ impl TransitionRecord {
         finite("action", &self.action)?;
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
-        let terms = self.reward_terms;
-        // Added up as the actor does, so that the sums are the same to the last bit.
-        if self.reward != terms[0] + terms[1] + terms[2] + terms[3] {
+        // Summed in the actor's order, so that the sums are bit-equal.
+        let sum = self.reward_terms.into_iter().reduce(|sum, term| sum + term);
+        if Some(self.reward) != sum {
             return Err(RecordFault::Contradiction {
                 what: "the reward is not the sum of its terms",
             });
         }
         if self.action.iter().any(|value| value.abs() > 1.0) {
-            return Err(RecordFault::ActionOutOfRange { action: self.action });
+            return Err(RecordFault::ActionOutOfRange {
+                action: self.action,
+            });
         }
         for (name, value) in [
             ("level_up", self.level_up),
@@ -254,7 +294,7 @@ impl TransitionRecord {
         }
         if self.terminated == 1 && self.truncated == 1 {
             return Err(RecordFault::Contradiction {
-                what: "the flight was terminated and truncated in one step",
+                what: "the episode was terminated and truncated in one step",
             });
         }
         Ok(())
@@ -263,7 +303,9 @@ impl TransitionRecord {
     fn check_ending(&self) -> Result<(), RecordFault> {
         let (name, value) = if Outcome::from_code(self.outcome).is_none() {
             ("outcome", self.outcome)
-        } else if u32::from(self.start_level) + u32::from(self.walls_passed) > u32::from(self.course_walls) + 1 {
+        } else if u32::from(self.start_level) + u32::from(self.walls_passed)
+            > u32::from(self.course_walls) + 1
+        {
             ("walls_passed", self.walls_passed)
         } else if !self.may_have_hit_wall() {
             ("hit_wall", self.hit_wall)
@@ -273,7 +315,8 @@ impl TransitionRecord {
         Err(RecordFault::Code { name, value })
     }
 
-    /// Whether `hit_wall` is none, or one that a flight which collided could reach: no farther than the first that it has not passed.
+    /// Returns `true` if `hit_wall` is 0, or a wall that an episode which collided could reach: at
+    /// most the first one that it has not passed.
     fn may_have_hit_wall(&self) -> bool {
         let next = u32::from(self.start_level) + u32::from(self.walls_passed);
         let reachable = next.min(self.course_walls.into());
@@ -282,20 +325,20 @@ impl TransitionRecord {
     }
 }
 
-/// Why a record is not believed.
+/// Reason why a record is refused.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum RecordFault {
-    /// It belongs to something else, or has a gap before it.
-    #[error("{name} is {found} where {expected} is expected")]
+    /// The record belongs elsewhere, or records before it are missing.
+    #[error("{name} is {found}, expected {expected}")]
     Mismatch {
         /// The field.
         name: &'static str,
         /// Its value.
         found: u64,
-        /// The value it should have.
+        /// The expected value.
         expected: u64,
     },
-    /// A field has a value that no flight gives it.
+    /// A field has a value that no episode produces.
     #[error("{name} has the impossible value {value}")]
     Code {
         /// The field.
@@ -303,33 +346,33 @@ pub enum RecordFault {
         /// Its value.
         value: u8,
     },
-    /// A field holds an infinity or no number.
+    /// A field is infinite or NaN.
     #[error("{name} is not finite")]
     NotFinite {
         /// The field.
         name: &'static str,
     },
-    /// A field holds a number beyond anything that is simulated.
-    #[error("{name} holds {value}, beyond {LARGEST_NUMBER}")]
+    /// A field exceeds every simulated value.
+    #[error("{name} holds {value}, beyond {MAX_MAGNITUDE}")]
     TooLarge {
         /// The field.
         name: &'static str,
         /// The number.
         value: f32,
     },
-    /// The flight goes on and on.
-    #[error("the flight has more than the {most} records of transport.max_records_per_flight")]
+    /// The episode is too long.
+    #[error("the episode has more than the {most} records of transport.max_records_per_episode")]
     TooLong {
-        /// Records of the longest flight.
+        /// Records of the longest episode.
         most: usize,
     },
-    /// It contradicts itself or the records before it.
+    /// The record contradicts itself or earlier records.
     #[error("{what}")]
     Contradiction {
-        /// What cannot be.
+        /// The contradiction.
         what: &'static str,
     },
-    /// An action no policy of ours chooses.
+    /// An action that no policy of Skein chooses.
     #[error("action {action:?} is outside [-1, 1]")]
     ActionOutOfRange {
         /// The action.
@@ -340,24 +383,24 @@ pub enum RecordFault {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::LONGEST_LATENT;
-    use crate::ids::{Attempt, FlightId, PolicyVersion, RunId};
+    use crate::MAX_LATENT;
+    use crate::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
     use crate::ticket::{CourseChoice, Exploration};
 
     const ACTOR: ActorId = ActorId(2);
-    const INCARNATION: Incarnation = Incarnation(11);
+    const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 
     fn ticket() -> Ticket {
         Ticket {
             run: RunId(1),
-            flight: FlightId(5),
+            episode: EpisodeId(5),
             attempt: Attempt(0),
             policy_version: PolicyVersion(3),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 9,
-            leg: None,
+            segment: None,
         }
     }
 
@@ -373,7 +416,10 @@ mod tests {
         record.depth[17] = 200;
         record.begin(&ticket(), ACTOR, INCARNATION, 4);
         assert_eq!(record.depth[17], 200);
-        assert_eq!(record.check(&ticket(), ACTOR, INCARNATION, 4), Ok(RecordKind::Step));
+        assert_eq!(
+            record.check(&ticket(), ACTOR, INCARNATION, 4),
+            Ok(RecordKind::Step)
+        );
     }
 
     #[test]
@@ -381,10 +427,13 @@ mod tests {
         let check = |change: fn(&mut TransitionRecord)| {
             let mut record = record();
             change(&mut record);
-            record.check(&ticket(), ACTOR, INCARNATION, 4).unwrap_err().to_string()
+            record
+                .check(&ticket(), ACTOR, INCARNATION, 4)
+                .unwrap_err()
+                .to_string()
         };
         assert!(check(|r| r.run = 2).contains("run"));
-        assert!(check(|r| r.flight = 6).contains("flight"));
+        assert!(check(|r| r.episode = 6).contains("episode"));
         assert!(check(|r| r.policy_version = 4).contains("policy_version"));
         assert!(check(|r| r.attempt = 1).contains("attempt"));
         assert!(check(|r| r.actor = 3).contains("actor"));
@@ -399,7 +448,9 @@ mod tests {
         assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
         assert!(check(|r| r.terminated = 2).contains("terminated"));
         assert!(check(|r| r.reward = 0.5).contains("not the sum of its terms"));
-        assert!(check(|r| (r.terminated, r.truncated) = (1, 1)).contains("terminated and truncated"));
+        assert!(
+            check(|r| (r.terminated, r.truncated) = (1, 1)).contains("terminated and truncated")
+        );
         let closes = |r: &mut TransitionRecord| {
             r.kind = RecordKind::Closing.code();
             r.outcome = Outcome::ReachedEnd.code();
@@ -413,7 +464,7 @@ mod tests {
         let mut record = record();
         record.latent[..16].fill(0.5);
         assert_eq!(record.check_latent(16), Ok(()));
-        assert_eq!(record.check_latent(LONGEST_LATENT), Ok(()));
+        assert_eq!(record.check_latent(MAX_LATENT), Ok(()));
         for value in [1e-30, f32::NAN] {
             record.latent[15] = value;
             let refused = record.check_latent(15).unwrap_err().to_string();
@@ -422,7 +473,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_is_hit_only_by_a_flight_that_collided_and_could_reach_it() {
+    fn a_wall_is_hit_only_by_an_episode_that_collided_and_could_reach_it() {
         let hit = |outcome: Outcome, hit_wall| {
             let mut record = record();
             record.kind = RecordKind::Closing.code();
@@ -439,7 +490,11 @@ mod tests {
             (Outcome::TimedOut, 3, false),
             (Outcome::ReachedEnd, 1, false),
         ] {
-            assert_eq!(hit(outcome, hit_wall).is_ok(), is_sound, "{outcome:?}, wall {hit_wall}");
+            assert_eq!(
+                hit(outcome, hit_wall).is_ok(),
+                is_sound,
+                "{outcome:?}, wall {hit_wall}"
+            );
         }
     }
 }

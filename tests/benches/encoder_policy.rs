@@ -1,4 +1,5 @@
-//! An actor's thinking, one image and one action at a time: native, and by libtorch, which only the learner has. The one benchmark that needs both.
+//! Inference of an actor, one image and one action at a time: native, and by libtorch, which only
+//! the learner has. This benchmark is the only one that needs both.
 
 use std::hint::black_box;
 
@@ -8,13 +9,15 @@ use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation, Precision, View};
+use skein_protocol::config::{Config, Observation, ObservationLayout};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout};
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LONGEST_LATENT, LatentCode};
+use skein_protocol::snapshot::{
+    ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
+};
+use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_LATENT};
 use tch::Device;
 
-/// As in `local.toml`.
+/// Settings of `local.toml`.
 const OBSERVATION: Observation = Observation::LatentVelocity;
 const STRIDE: usize = 2;
 
@@ -23,7 +26,7 @@ fn main() {
     use_threads(1);
     let mut config = Config::default();
     config.learning.observation = OBSERVATION;
-    let view = config.view();
+    let view = config.observation_layout();
     let vae = TorchVae::new(&config.vae, 1, Device::Cpu);
     let sac = TorchSac::new(&config.sac, Inputs::of(&config), 1, Device::Cpu);
     let layout = SnapshotLayout::of(&config);
@@ -36,24 +39,25 @@ fn main() {
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
     let mut observation = vec![0.0; view.len()];
     let mut observe = |latent: LatentCode| {
-        view.write_moment(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
+        view.write_step(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");
-    group.throughput(Throughput::Elements(operations(&view, config.sac.hidden_width)));
-    for (name, precision) in [("native", Precision::F32), ("native-bf16", Precision::Bf16)] {
-        let network = Network::new(&snapshot, &layout, precision);
-        group.bench_function(name, |bencher| {
-            let mut scratch = Scratch::default();
-            bencher.iter(|| {
-                let latent = network.encode(black_box(&image), &mut scratch);
-                black_box(network.distribution(&observe(latent), &mut scratch).mode())
-            });
+    group.throughput(Throughput::Elements(operations(
+        &view,
+        config.sac.hidden_width,
+    )));
+    let network = Network::new(&snapshot, &layout);
+    group.bench_function("native", |bencher| {
+        let mut scratch = Scratch::default();
+        bencher.iter(|| {
+            let latent = network.encode(black_box(&image), &mut scratch);
+            black_box(network.distribution(&observe(latent), &mut scratch).mode())
         });
-    }
+    });
     group.bench_function("libtorch", |bencher| {
         bencher.iter(|| {
-            let mut latent = [0.0; LONGEST_LATENT];
+            let mut latent = [0.0; MAX_LATENT];
             vae.encode(&images_from_bytes(black_box(&image)))
                 .copy_data(&mut latent, view.latent);
             black_box(sac.mode(&observe(latent)))
@@ -63,15 +67,16 @@ fn main() {
     criterion.final_summary();
 }
 
-/// Floating-point operations of the products of both networks, a multiplication and an addition counted as two; nothing else is counted.
-fn operations(view: &View, width: usize) -> u64 {
+/// Returns the floating-point operations of the matrix products of both networks. A multiplication
+/// and an addition count as two; nothing else counts.
+fn operations(layout: &ObservationLayout, width: usize) -> u64 {
     let mut size = [IMAGE_HEIGHT, IMAGE_WIDTH];
     let mut products = 0;
     for channels in ENCODER_CHANNELS.windows(2) {
         size = size.map(|length| (length - ENCODER_KERNEL) / STRIDE + 1);
         products += size[0] * size[1] * ENCODER_KERNEL * ENCODER_KERNEL * channels[0] * channels[1];
     }
-    products += ENCODER_FEATURES * view.latent;
-    products += view.len() * width + 2 * width * width + width * 2 * ACTION;
+    products += ENCODER_FEATURES * layout.latent;
+    products += layout.len() * width + 2 * width * width + width * 2 * ACTION;
     2 * products as u64
 }

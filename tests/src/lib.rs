@@ -1,14 +1,19 @@
-//! Whole-system tests: what only holds, or fails, between the packages. They lie in `tests/`, one file a subject.
+//! Tests of the whole system: properties that depend on several packages. They lie in `tests/`, one
+//! file per subject.
 //!
-//! Here is what they share: runs of the real programs, with a time limit on every wait and nothing left behind, however a test ends.
+//! This library holds what they share: runs of the real programs, with a time limit on every wait,
+//! that leave nothing behind however a test ends.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
-mod flights;
+mod episodes;
 mod programs;
 mod run;
 
-pub use flights::{Flight, Learned, flights};
-pub use programs::{Output, program, repository, run_program};
-pub use run::{Ended, Recipe, Running};
-pub use skein_launch::inspection::{Process, Role, leftovers, processes_of};
+pub use episodes::{EpisodeRow, LearnedResults, episodes};
+pub use programs::{ProgramOutput, program, repository, run_program};
+pub use run::{EndedRun, RunRecipe, RunningRun};
+pub use skein_chaos::{ListedProcess, Role, leftovers, processes_of};

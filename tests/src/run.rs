@@ -9,26 +9,27 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
-use skein_launch::inspection::{Process, Role, compare, leftovers, processes_of};
+use skein_chaos::{ListedProcess, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::{RunDirectory, sweep_leftovers};
 use skein_protocol::summary::Summary;
+use skein_run::signals::heed;
+use skein_run::{RunDirectory, sweep_leftovers};
 use tempfile::TempDir;
 
-use crate::flights::{Flight, Learned, flights};
-use crate::programs::{Output, program, repository};
+use crate::episodes::{EpisodeRow, LearnedResults, episodes};
+use crate::programs::{ProgramOutput, program, repository};
 
-/// No run here takes a fifth of it on an idle machine.
+/// Time limit of a run. On an idle machine, none takes a fifth of it.
 const LIMIT: Duration = Duration::from_secs(180);
-/// Between two looks at what is waited for.
-const LOOK: Duration = Duration::from_millis(20);
+/// Time between two checks of a condition.
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// One run at a time in a test process: each takes all cores.
+/// Lock for one run at a time per test process, because each takes all cores.
 static TURN: Mutex<()> = Mutex::new(());
 
-/// A run to be started.
+/// Description of a run to start.
 #[derive(Debug, Clone)]
-pub struct Recipe {
+pub struct RunRecipe {
     config: PathBuf,
     overrides: Vec<String>,
     environment: Vec<(String, String)>,
@@ -36,18 +37,18 @@ pub struct Recipe {
     within: Option<PathBuf>,
 }
 
-impl Recipe {
-    /// The shipped `configs/smoke.toml`, two actors.
+impl RunRecipe {
+    /// Returns the shipped `configs/smoke.toml` with two actors.
     pub fn smoke() -> Self {
         Self::of(repository().join("configs/smoke.toml"))
     }
 
-    /// `tests/small.toml`, two actors: a few seconds.
+    /// Returns `tests/small.toml` with two actors, which takes a few seconds.
     pub fn small() -> Self {
         Self::of(repository().join("tests/small.toml"))
     }
 
-    /// The configuration file `config`, two actors.
+    /// Returns the configuration file `config` with two actors.
     pub fn of(config: PathBuf) -> Self {
         Self {
             config,
@@ -58,48 +59,48 @@ impl Recipe {
         }
     }
 
-    /// With its directory in this folder.
+    /// Puts the run's directory into this folder.
     pub fn within(mut self, folder: &Path) -> Self {
         self.within = Some(folder.to_owned());
         self
     }
 
-    /// With so many actors.
+    /// Sets the number of actors.
     pub fn actors(mut self, actors: u32) -> Self {
         self.actors = actors;
         self
     }
 
-    /// With `--set section.key=value`.
+    /// Adds `--set section.key=value`.
     pub fn set(mut self, setting: &str) -> Self {
         self.overrides.push(setting.to_owned());
         self
     }
 
-    /// With this environment variable.
+    /// Sets an environment variable.
     pub fn environment(mut self, name: &str, value: &str) -> Self {
         self.environment.push((name.to_owned(), value.to_owned()));
         self
     }
 
-    /// Starts it; waits until no other run of this test process is under way.
+    /// Starts the run, after all other runs of this test process have ended.
     ///
     /// # Panics
-    /// When it cannot be started.
-    pub fn start(self) -> Running {
+    /// Panics if it cannot be started.
+    pub fn start(self) -> RunningRun {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         self.start_in_turn(Some(turn))
     }
 
-    /// Starts it while `_other` is under way.
+    /// Starts the run while `_other` is under way.
     ///
     /// # Panics
-    /// When it cannot be started.
-    pub fn start_beside(self, _other: &Running) -> Running {
+    /// Panics if it cannot be started.
+    pub fn start_beside(self, _other: &RunningRun) -> RunningRun {
         self.start_in_turn(None)
     }
 
-    fn start_in_turn(self, turn: Option<MutexGuard<'static, ()>>) -> Running {
+    fn start_in_turn(self, turn: Option<MutexGuard<'static, ()>>) -> RunningRun {
         let folder = tempfile::tempdir().unwrap();
         let within = self.within.as_deref().unwrap_or(folder.path());
         let root = within.canonicalize().unwrap().join("run");
@@ -111,7 +112,7 @@ impl Recipe {
             .arg(&root)
             .args(self.overrides.iter().flat_map(|setting| ["--set", setting]))
             .envs(self.environment);
-        Running {
+        RunningRun {
             supervisor: command.spawn().unwrap(),
             attached: Vec::new(),
             directory: RunDirectory::new(root),
@@ -121,16 +122,16 @@ impl Recipe {
         }
     }
 
-    /// Runs it to its end and requires that it succeeds.
+    /// Runs it to its end and asserts success.
     ///
     /// # Panics
-    /// When it does not.
-    pub fn finish(self) -> Ended {
+    /// Panics if it fails.
+    pub fn finish(self) -> EndedRun {
         self.start().finish()
     }
 }
 
-/// `skein run` with so many actors, saying what it says to files in `folder`.
+/// Returns `skein run` with `actors` actors and its output in files in `folder`.
 fn skein_run(folder: &Path, actors: u32) -> Command {
     let mut command = Command::new(program("skein"));
     command
@@ -140,12 +141,14 @@ fn skein_run(folder: &Path, actors: u32) -> Command {
         .stdin(Stdio::null())
         .stdout(File::create(folder.join("stdout")).unwrap())
         .stderr(File::create(folder.join("stderr")).unwrap());
+    // Tests interrupt it, and may themselves run in the background of a script, which ignores this.
+    heed(&mut command, Signal::INT);
     command
 }
 
-/// A run under way. Its processes and all they left are cleared away when it goes out of scope.
+/// A run under way. Its processes and remains are cleared away when it goes out of scope.
 #[derive(Debug)]
-pub struct Running {
+pub struct RunningRun {
     supervisor: Child,
     attached: Vec<Child>,
     directory: RunDirectory,
@@ -154,61 +157,76 @@ pub struct Running {
     _turn: Option<MutexGuard<'static, ()>>,
 }
 
-impl Running {
-    /// Its directory.
+impl RunningRun {
+    /// Returns its directory.
     pub fn directory(&self) -> &RunDirectory {
         &self.directory
     }
 
-    /// What the supervisor has said on standard error so far.
+    /// Returns the supervisor's standard error so far.
     pub fn stderr(&self) -> String {
-        let folder = self.folder.as_ref().expect("it is taken only at the end");
+        let folder = self
+            .folder
+            .as_ref()
+            .expect("the folder is taken only at the end");
         fs::read_to_string(folder.path().join("stderr")).unwrap()
     }
 
-    /// Waits until `condition` gives something.
+    /// Waits until `condition` returns a value.
     ///
     /// # Panics
-    /// When the run ends before, or the time is up; `what` says what was waited for.
+    /// Panics if the run ends before, or the time is up; `what` describes the condition.
     pub fn until<T>(&mut self, what: &str, mut condition: impl FnMut(&Self) -> Option<T>) -> T {
         loop {
             if let Some(found) = condition(self) {
                 return found;
             }
             let ended = self.supervisor.try_wait().unwrap();
-            assert!(ended.is_none(), "the run ended before {what}:\n{}", self.stderr());
-            assert!(Instant::now() < self.deadline, "never {what}:\n{}", self.stderr());
-            sleep(LOOK);
+            assert!(
+                ended.is_none(),
+                "the run ended before {what}:\n{}",
+                self.stderr()
+            );
+            assert!(
+                Instant::now() < self.deadline,
+                "never {what}:\n{}",
+                self.stderr()
+            );
+            sleep(POLL_INTERVAL);
         }
     }
 
-    /// Waits until the supervisor has ended, of itself or because it was told to.
+    /// Waits until the supervisor has ended, by itself or on request.
     ///
     /// # Panics
-    /// When the time is up.
+    /// Panics if the time is up.
     pub fn until_ended(&mut self) {
         while self.supervisor.try_wait().unwrap().is_none() {
-            assert!(Instant::now() < self.deadline, "it does not end:\n{}", self.stderr());
-            sleep(LOOK);
+            assert!(
+                Instant::now() < self.deadline,
+                "the run does not end:\n{}",
+                self.stderr()
+            );
+            sleep(POLL_INTERVAL);
         }
     }
 
-    /// Waits until so many training flights are learned from.
+    /// Waits until `count` training episodes are learned from.
     ///
     /// # Panics
-    /// As [`Running::until`].
-    pub fn until_flights(&mut self, count: usize) {
-        self.until(&format!("{count} flights were learned from"), |run| {
-            (flights(&run.directory).len() >= count).then_some(())
+    /// As [`RunningRun::until`].
+    pub fn until_episodes(&mut self, count: usize) {
+        self.until(&format!("{count} episodes were learned from"), |run| {
+            (episodes(&run.directory).len() >= count).then_some(())
         });
     }
 
-    /// Kills the learner once so many flights were learned from, and waits until another is there.
+    /// Kills the learner once `episodes` episodes were learned from, and waits for the next.
     ///
     /// # Panics
-    /// When the run ends before, or none comes.
-    pub fn kill_learner_after(&mut self, flights: usize) {
-        self.until_flights(flights);
+    /// Panics if the run ends before, or no learner follows.
+    pub fn kill_learner_after(&mut self, episodes: usize) {
+        self.until_episodes(episodes);
         let victim = self.process("skein-learner");
         victim.signal(Signal::KILL);
         self.until("another learner was there", |run| {
@@ -220,7 +238,7 @@ impl Running {
     /// Starts `skein attach` with one actor.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// Panics if it cannot be started.
     pub fn attach(&mut self) {
         let attached = Command::new(program("skein"))
             .arg("attach")
@@ -234,39 +252,43 @@ impl Running {
         self.attached.push(attached);
     }
 
-    /// Sends `signal` to the supervisor alone.
+    /// Sends `signal` to the supervisor only.
     ///
     /// # Panics
-    /// When it has been reaped already.
+    /// Panics if it has been reaped already.
     pub fn signal(&self, signal: Signal) {
         let pid = Pid::from_raw(self.supervisor.id().cast_signed()).unwrap();
         kill_process(pid, signal).unwrap();
     }
 
-    /// The process of this run that runs `program`, the first of several.
+    /// Returns the first process of this run that runs `program`.
     ///
     /// # Panics
-    /// When there is none.
-    pub fn process(&self, program: &str) -> Process {
+    /// Panics if there is none.
+    pub fn process(&self, program: &str) -> ListedProcess {
         let processes = processes_of(&self.directory);
         let found = processes.into_iter().find(|process| process.runs(program));
-        found.unwrap_or_else(|| panic!("no {program} is there:\n{}", self.stderr()))
+        found.unwrap_or_else(|| panic!("no {program} is running:\n{}", self.stderr()))
     }
 
-    /// Its processes of this role, oldest first.
-    pub fn processes(&self, role: Role) -> Vec<Process> {
+    /// Returns its processes with this role, oldest first.
+    pub fn processes(&self, role: Role) -> Vec<ListedProcess> {
         let mut processes = processes_of(&self.directory);
         processes.retain(|process| process.role() == role);
         processes
     }
 
-    /// Kills the supervisor alone.
+    /// Kills the supervisor only.
     ///
     /// # Panics
-    /// When it had ended already.
+    /// Panics if it had ended already.
     pub fn kill_supervisor(&mut self) {
         let ended = self.supervisor.try_wait().unwrap();
-        assert!(ended.is_none(), "the run ended too soon:\n{}", self.stderr());
+        assert!(
+            ended.is_none(),
+            "the run ended too early:\n{}",
+            self.stderr()
+        );
         self.supervisor.kill().unwrap();
         self.supervisor.wait().unwrap();
     }
@@ -274,43 +296,61 @@ impl Running {
     /// Kills all its processes at once, as a power cut does.
     ///
     /// # Panics
-    /// When one of them does not end.
+    /// Panics if one of them does not end.
     pub fn cut_off(&mut self) {
         processes_of(&self.directory)
             .iter()
             .for_each(|process| process.signal(Signal::KILL));
         self.supervisor.wait().unwrap();
         while !processes_of(&self.directory).is_empty() {
-            assert!(Instant::now() < self.deadline, "{:?}", processes_of(&self.directory));
-            sleep(LOOK);
+            assert!(
+                Instant::now() < self.deadline,
+                "{:?}",
+                processes_of(&self.directory)
+            );
+            sleep(POLL_INTERVAL);
         }
     }
 
-    /// Goes on with it, with so many actors, once its supervisor has ended, however it did.
+    /// Resumes it with `actors` actors after its supervisor has ended.
     ///
     /// # Panics
-    /// When it cannot be started.
+    /// Panics if it cannot be started.
     pub fn resume(&mut self, actors: u32) {
+        self.resume_with(actors, &[]);
+    }
+
+    /// As [`RunningRun::resume`], with more arguments.
+    ///
+    /// # Panics
+    /// Panics if it cannot be started.
+    pub fn resume_with(&mut self, actors: u32, arguments: &[&str]) {
         self.supervisor.wait().unwrap();
-        let folder = self.folder.as_ref().expect("it is taken only at the end");
+        let folder = self
+            .folder
+            .as_ref()
+            .expect("the folder is taken only at the end");
         let mut command = skein_run(folder.path(), actors);
-        command.arg("--resume").arg(self.directory.root());
+        command
+            .arg("--resume")
+            .arg(self.directory.root())
+            .args(arguments);
         self.supervisor = command.spawn().unwrap();
         self.deadline = Instant::now() + LIMIT;
     }
 
-    /// Waits for the end of the supervisor and of those attached, which must succeed.
+    /// Waits for the end of the supervisor and of the `skein attach` processes, which must succeed.
     ///
     /// # Panics
-    /// When the time is up, or one attached failed.
-    pub fn wait(mut self) -> Ended {
+    /// Panics if the time is up, or an attach process failed.
+    pub fn wait(mut self) -> EndedRun {
         self.until_ended();
         let status = self.supervisor.wait().unwrap();
         for attached in &mut self.attached {
-            // It ends with the run, unless it hangs: then its end is not waited for here.
+            // Attach processes end with the run; one that hangs is not waited for here.
             let end = Instant::now() + Duration::from_secs(20);
             while attached.try_wait().unwrap().is_none() && Instant::now() < end {
-                sleep(LOOK);
+                sleep(POLL_INTERVAL);
             }
             let status = attached.try_wait().unwrap();
             assert!(
@@ -319,21 +359,21 @@ impl Running {
             );
         }
         let left = leftovers(&self.directory);
-        let folder = self.folder.take().expect("it is taken only here");
+        let folder = self.folder.take().expect("the folder is taken only here");
         let read = |name| fs::read(folder.path().join(name)).unwrap();
-        Ended {
-            output: Output::of(status, &read("stdout"), &read("stderr")),
+        EndedRun {
+            output: ProgramOutput::of(status, &read("stdout"), &read("stderr")),
             directory: self.directory.clone(),
             left,
             _folder: folder,
         }
     }
 
-    /// Waits for the end and requires that the run succeeded and left nothing behind.
+    /// Waits for the end and asserts that the run succeeded and left nothing behind.
     ///
     /// # Panics
-    /// When it did not.
-    pub fn finish(self) -> Ended {
+    /// Panics if it did not.
+    pub fn finish(self) -> EndedRun {
         let ended = self.wait();
         assert_eq!(ended.output.code, Some(0), "{}", ended.output.stderr);
         ended.assert_nothing_is_left();
@@ -341,9 +381,9 @@ impl Running {
     }
 }
 
-impl Drop for Running {
+impl Drop for RunningRun {
     fn drop(&mut self) {
-        // Nothing here may panic: a test that failed comes through here.
+        // Nothing here may panic, because failing tests come through here.
         let _ = self.supervisor.kill();
         let _ = self.supervisor.wait();
         let end = Instant::now() + Duration::from_secs(10);
@@ -353,7 +393,7 @@ impl Drop for Running {
             if left.is_empty() || Instant::now() > end {
                 break;
             }
-            sleep(LOOK);
+            sleep(POLL_INTERVAL);
         }
         for attached in &mut self.attached {
             let _ = attached.wait();
@@ -364,70 +404,76 @@ impl Drop for Running {
 
 /// A run that has ended. Its directory is removed when it goes out of scope.
 #[derive(Debug)]
-pub struct Ended {
-    /// How the supervisor ended.
-    pub output: Output,
-    /// The run's directory.
+pub struct EndedRun {
+    /// ProgramOutput and exit status of the supervisor.
+    pub output: ProgramOutput,
+    /// Run directory.
     pub directory: RunDirectory,
     left: Vec<String>,
     _folder: TempDir,
 }
 
-impl Ended {
-    /// Requires that no process, shared memory or socket was left the moment the supervisor had ended.
+impl EndedRun {
+    /// Asserts that no process, shared memory or socket was left when the supervisor ended.
     ///
     /// # Panics
-    /// When something was.
+    /// Panics if something was left.
     pub fn assert_nothing_is_left(&self) {
         assert!(self.left.is_empty(), "left behind: {:#?}", self.left);
     }
 
-    /// `summary.json`.
+    /// Reads `summary.json`.
     ///
     /// # Panics
-    /// When it is not there or malformed.
+    /// Panics if it is missing or malformed.
     pub fn summary(&self) -> Summary {
         json(self.directory.summary_json())
     }
 
-    /// `evaluation.json`.
+    /// Reads `evaluation.json`.
     ///
     /// # Panics
-    /// As [`Ended::summary`].
+    /// Panics like [`EndedRun::summary`].
     pub fn evaluation(&self) -> EvaluationReport {
         json(self.directory.evaluation_json())
     }
 
-    /// `flights.csv`.
+    /// Reads `episodes.csv`.
     ///
     /// # Panics
-    /// When it is malformed.
-    pub fn flights(&self) -> Vec<Flight> {
-        flights(&self.directory)
+    /// Panics if it is malformed.
+    pub fn episodes(&self) -> Vec<EpisodeRow> {
+        episodes(&self.directory)
     }
 
-    /// Requires that it came to the same as `calm`, in every file and every point of every curve, who flew what apart.
+    /// Asserts that it has the results of `calm`, in every file and every point of every curve,
+    /// except for the actor of each episode.
     ///
     /// # Panics
-    /// When it did not; the message names every difference.
+    /// Panics if it has not; the message names every difference.
     pub fn assert_same_as(&self, calm: &Self) {
         let differences: Vec<_> = compare(&calm.directory, &self.directory)
             .into_iter()
             .filter_map(|check| Some(format!("{}: {}", check.what, check.verdict.err()?)))
             .collect();
-        assert!(differences.is_empty(), "{differences:#?}\n{}", self.output.stderr);
+        assert!(
+            differences.is_empty(),
+            "{differences:#?}\n{}",
+            self.output.stderr
+        );
     }
 
-    /// What must be the same however the run was flown.
+    /// Returns the results that do not depend on how the run was flown.
     ///
     /// # Panics
-    /// As [`Ended::summary`].
-    pub fn learned(&self) -> Learned {
-        Learned::of(&self.directory, &self.summary())
+    /// Panics like [`EndedRun::summary`].
+    pub fn learned(&self) -> LearnedResults {
+        LearnedResults::of(&self.directory, &self.summary())
     }
 }
 
 fn json<T: DeserializeOwned>(path: PathBuf) -> T {
-    let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    let text =
+        fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }

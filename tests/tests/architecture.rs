@@ -1,6 +1,10 @@
-//! Who may depend on whom. A package exists where a heavy dependency is fenced in; here is the fence.
+//! Allowed dependencies between packages. A package exists where a heavy dependency is confined;
+//! this test holds the confinement.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -8,27 +12,33 @@ use std::fs;
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 use skein_tests::repository;
 
-/// The folders a reader finds, and no others.
-const FOLDERS: [&str; 6] = ["actor", "configs", "launch", "learner", "protocol", "tests"];
+/// The folders at the top level, complete.
+const FOLDERS: [&str; 7] = [
+    "actor", "configs", "docs", "launch", "learner", "protocol", "tests",
+];
 
-/// Whether programs alone are asked, or their tests too.
+/// Dependencies to consider: those of programs, or also those of tests.
 #[derive(Clone, Copy, PartialEq)]
 enum Of {
     Programs,
     Tests,
 }
 
-/// Names of everything that `package` depends on, directly or not.
+/// Returns the names of all direct and indirect dependencies of `package`.
 fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> {
     let resolve = metadata.resolve.as_ref().unwrap();
-    let nodes: BTreeMap<&PackageId, _> = resolve.nodes.iter().map(|node| (&node.id, node)).collect();
+    let nodes: BTreeMap<&PackageId, _> =
+        resolve.nodes.iter().map(|node| (&node.id, node)).collect();
     let packages = metadata.workspace_packages();
-    let start = packages.iter().find(|found| found.name.as_str() == package).unwrap();
+    let start = packages
+        .iter()
+        .find(|found| found.name.as_str() == package)
+        .unwrap();
     let mut seen: BTreeSet<&PackageId> = BTreeSet::new();
     let mut to_see = vec![&start.id];
     while let Some(id) = to_see.pop() {
         for dependency in &nodes[id].deps {
-            // A dependency's own tests are nobody's business.
+            // Tests of a dependency do not matter.
             let for_tests = id == &start.id && of == Of::Tests;
             let counts = dependency
                 .dep_kinds
@@ -39,58 +49,166 @@ fn dependencies(metadata: &Metadata, package: &str, of: Of) -> BTreeSet<String> 
             }
         }
     }
-    seen.iter().map(|id| metadata[id].name.to_string()).collect()
+    seen.iter()
+        .map(|id| metadata[id].name.to_string())
+        .collect()
 }
 
 fn metadata() -> Metadata {
     MetadataCommand::new()
         .manifest_path(repository().join("Cargo.toml"))
-        // What this machine builds is all here already; what other platforms would build may not be.
-        .other_options(["--locked", "--offline", "--filter-platform", env!("SKEIN_TARGET")].map(str::to_owned))
+        // This machine's dependencies are all downloaded; those of other platforms may not be.
+        .other_options(
+            [
+                "--locked",
+                "--offline",
+                "--filter-platform",
+                env!("SKEIN_TARGET"),
+            ]
+            .map(str::to_owned),
+        )
         .exec()
         .unwrap()
 }
 
 #[test]
-fn every_package_keeps_to_its_side_of_the_fence() {
+fn every_package_has_only_its_allowed_dependencies() {
     let metadata = metadata();
     let of_ours: BTreeSet<String> = metadata
         .workspace_packages()
         .iter()
         .map(|package| package.name.to_string())
         .collect();
-    let torch = ["tch", "torch-sys"];
-    let physics = ["rapier3d", "parry3d"];
+    let torch = &["tch", "torch-sys"][..];
+    let physics = &["rapier3d", "parry3d"][..];
+    let transport = &["iceoryx2", "iceoryx2-bb-posix"][..];
+    let tokio = &["tokio"][..];
     for (package, allowed, forbidden) in [
-        ("skein-simulator", &[][..], [&torch[..], &["iceoryx2"]].concat()),
-        ("skein-protocol", &[], [torch, physics].concat()),
+        ("skein-simulator", &[][..], &[torch, transport, tokio][..]),
+        ("skein-protocol", &[], &[torch, physics, transport, tokio]),
         (
-            "skein-actor",
-            &["skein-inference", "skein-kernels", "skein-protocol", "skein-simulator"],
-            torch.to_vec(),
+            "skein-run",
+            &["skein-protocol"],
+            &[torch, physics, transport, tokio],
         ),
+        (
+            "skein-transport",
+            &["skein-protocol", "skein-run"],
+            &[torch, physics, tokio],
+        ),
+        ("skein-kernels", &[], &[torch, physics, transport, tokio]),
         (
             "skein-inference",
             &["skein-kernels", "skein-protocol"],
-            [torch, physics].concat(),
+            &[torch, physics, transport, tokio],
         ),
-        ("skein-kernels", &[], [torch, physics].concat()),
+        (
+            "skein-rollout",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
+        (
+            "skein-evaluate",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-reports",
+                "skein-rollout",
+                "skein-run",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
+        (
+            "skein-actor",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-rollout",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch, tokio],
+        ),
         (
             "skein-learner",
-            &["skein-inference", "skein-kernels", "skein-protocol"],
-            physics.to_vec(),
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-run",
+                "skein-transport",
+            ],
+            &[physics],
+        ),
+        (
+            "skein-prepare",
+            &[
+                "skein-protocol",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
+        ),
+        (
+            "skein-reports",
+            &["skein-protocol", "skein-run", "skein-simulator"],
+            &[torch, transport],
+        ),
+        // An experiment starts `skein run`: it knows no supervisor.
+        (
+            "skein-experiments",
+            &[
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
         ),
         (
             "skein-launch",
-            &["skein-kernels", "skein-protocol", "skein-simulator"],
-            torch.to_vec(),
+            &[
+                "skein-evaluate",
+                "skein-experiments",
+                "skein-inference",
+                "skein-kernels",
+                "skein-prepare",
+                "skein-protocol",
+                "skein-reports",
+                "skein-rollout",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch],
+        ),
+        // The judge of a run trusts none of its programs.
+        (
+            "skein-chaos",
+            &["skein-protocol", "skein-run"],
+            &[torch, physics, transport],
         ),
     ] {
         for of in [Of::Programs, Of::Tests] {
             let found = dependencies(&metadata, package, of);
             let ours: Vec<_> = found.intersection(&of_ours).map(String::as_str).collect();
-            assert_eq!(ours, allowed, "packages of ours that {package} depends on");
-            for fenced in &forbidden {
+            assert_eq!(
+                ours, allowed,
+                "workspace packages that {package} depends on"
+            );
+            for fenced in forbidden.iter().copied().flatten() {
                 assert!(!found.contains(*fenced), "{package} depends on {fenced}");
             }
         }
@@ -98,30 +216,34 @@ fn every_package_keeps_to_its_side_of_the_fence() {
 }
 
 #[test]
-fn what_is_fenced_in_is_found_where_it_belongs() {
+fn confined_dependencies_are_found_where_they_belong() {
     let metadata = metadata();
     for (package, inside) in [
         ("skein-learner", "tch"),
         ("skein-simulator", "rapier3d"),
-        ("skein-protocol", "iceoryx2"),
+        ("skein-transport", "iceoryx2"),
+        ("skein-transport", "iceoryx2-bb-posix"),
+        ("skein-learner", "tokio"),
+        ("skein-rollout", "rapier3d"),
         ("skein-actor", "rapier3d"),
+        ("skein-reports", "plotters"),
     ] {
         assert!(
             dependencies(&metadata, package, Of::Programs).contains(inside),
-            "{package} does not depend on {inside}: the test of the fence sees nothing"
+            "{package} does not depend on {inside}: this test would find nothing"
         );
     }
 }
 
 #[test]
-fn the_top_level_has_the_fixed_folders_and_no_others() {
+fn the_top_level_has_exactly_the_fixed_folders() {
     let target = metadata().target_directory;
     let found: BTreeSet<String> = fs::read_dir(repository())
         .unwrap()
         .map(|entry| entry.unwrap())
         .filter(|entry| entry.path().is_dir() && entry.path() != target.as_std_path())
         .map(|entry| entry.file_name().into_string().unwrap())
-        // Where runs go, and builds that went elsewhere; neither is in the repository.
+        // Folders of runs and builds are not in the repository.
         .filter(|name| !name.starts_with('.') && name != "runs" && name != "target")
         .collect();
     assert_eq!(found, FOLDERS.map(str::to_owned).into_iter().collect());

@@ -1,6 +1,10 @@
-//! Whoever dies, freezes or is cut off, and however often: the run comes to what it would have come to, and leaves nothing behind.
+//! A run has the same results and leaves nothing behind, whichever of its processes die, freeze or
+//! are cut off, and however often.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::PathBuf;
@@ -10,19 +14,19 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::Signal;
-use skein_launch::inspection::{Footprint, footprint};
-use skein_protocol::run::RunIdentity;
-use skein_tests::{Ended, Recipe, Role, Running, flights, run_program};
+use skein_chaos::{Footprint, footprint};
+use skein_run::RunIdentity;
+use skein_tests::{EndedRun, Role, RunRecipe, RunningRun, episodes, run_program};
 
-/// Long enough to be disturbed several times.
-fn recipe() -> Recipe {
-    Recipe::small().set("run.flights=100")
+/// A run long enough to be disturbed several times.
+fn recipe() -> RunRecipe {
+    RunRecipe::small().set("run.episodes=100")
 }
 
-/// What it comes to when nobody disturbs it. Run once for all tests that are under way at a time; to be asked for before one's own run is started, which
-/// would be waited for.
-fn calm() -> Arc<Ended> {
-    static CALM: Mutex<Weak<Ended>> = Mutex::new(Weak::new());
+/// Returns the undisturbed run, shared by all tests that run at the same time. A test must request
+/// it before it starts its own run, which would block it.
+fn calm() -> Arc<EndedRun> {
+    static CALM: Mutex<Weak<EndedRun>> = Mutex::new(Weak::new());
     let mut known = CALM.lock().unwrap_or_else(PoisonError::into_inner);
     known.upgrade().unwrap_or_else(|| {
         let ended = Arc::new(recipe().finish());
@@ -32,23 +36,27 @@ fn calm() -> Arc<Ended> {
 }
 
 #[test]
-fn a_learner_killed_three_times_goes_on_from_its_checkpoints() {
+fn a_learner_killed_three_times_resumes_from_its_checkpoints() {
     let calm = calm();
     let mut run = recipe().start();
-    for flights in [10, 30, 70] {
-        run.kill_learner_after(flights);
+    for episodes in [10, 30, 70] {
+        run.kill_learner_after(episodes);
     }
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
-    let told = disturbed.output.stderr.matches("killed by signal 9").count();
-    assert_eq!(told, 3, "{}", disturbed.output.stderr);
+    let deaths = disturbed
+        .output
+        .stderr
+        .matches("killed by signal 9")
+        .count();
+    assert_eq!(deaths, 3, "{}", disturbed.output.stderr);
 }
 
 #[test]
 fn a_run_whose_supervisor_was_killed_is_resumed_with_another_number_of_actors() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(50);
+    run.until_episodes(50);
     run.kill_supervisor();
     run.resume(3);
     run.finish().assert_same_as(&calm);
@@ -73,18 +81,27 @@ fn after_a_power_cut_a_damaged_checkpoint_is_named_and_the_one_before_it_used() 
     resumed.assert_same_as(&calm);
     let name = newest.file_name().unwrap().to_str().unwrap();
     let terminal = &resumed.output.stderr;
-    let told = |words: [&str; 2]| {
+    let printed = |words: [&str; 2]| {
         terminal
             .lines()
             .any(|line| words.iter().all(|word| line.contains(word)))
     };
-    assert!(told([name, "damaged"]), "nobody was warned of {name}:\n{terminal}");
-    assert!(told(["going on after flight", ""]), "{terminal}");
+    assert!(
+        printed([name, "damaged"]),
+        "no warning about {name}:\n{terminal}"
+    );
+    assert!(printed(["resuming after episode", ""]), "{terminal}");
 }
 
-/// The checkpoints that are in their place, oldest first.
-fn checkpoints(run: &Running) -> Vec<PathBuf> {
-    let number = |path: &PathBuf| -> Option<u64> { path.file_name()?.to_str()?.strip_prefix("flight-")?.parse().ok() };
+/// Returns the complete checkpoints, oldest first.
+fn checkpoints(run: &RunningRun) -> Vec<PathBuf> {
+    let number = |path: &PathBuf| -> Option<u64> {
+        path.file_name()?
+            .to_str()?
+            .strip_prefix("episode-")?
+            .parse()
+            .ok()
+    };
     let mut found: Vec<_> = fs::read_dir(run.directory().checkpoints())
         .into_iter()
         .flatten()
@@ -95,39 +112,39 @@ fn checkpoints(run: &Running) -> Vec<PathBuf> {
     found
 }
 
-/// Lets `remove` take something of the transport from under a run.
-fn goes_on_without(remove: impl Fn(&Running, &RunIdentity)) {
+/// Asserts that a run survives the loss of a part of its transport, removed by `remove`.
+fn survives_loss_of(remove: impl Fn(&RunningRun, &RunIdentity)) {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(30);
+    run.until_episodes(30);
     remove(&run, &run.directory().open().unwrap().0);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
     assert!(disturbed.summary().resumes > 0, "{:?}", disturbed.summary());
     let terminal = &disturbed.output.stderr;
     assert!(
-        terminal.contains("was removed") && terminal.contains("leave what is called skein alone"),
+        terminal.contains("was removed") && terminal.contains("do not remove skein's files"),
         "{terminal}"
     );
 }
 
 #[test]
 fn a_run_whose_folder_is_removed_makes_another() {
-    goes_on_without(|_, identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
+    survives_loss_of(|_, identity| fs::remove_dir_all(identity.transport_folder()).unwrap());
 }
 
 #[test]
 fn a_run_whose_shared_memory_is_removed_makes_another() {
-    goes_on_without(|run, identity| {
+    survives_loss_of(|run, identity| {
         let prefix = format!("skein_{:016x}_", identity.run.0);
         for entry in fs::read_dir("/dev/shm").unwrap() {
             let entry = entry.unwrap();
             if entry.file_name().to_str().unwrap().starts_with(&prefix) {
-                // An actor's may go by itself.
+                // An actor may remove its own at any time.
                 let _ = fs::remove_file(entry.path());
             }
         }
-        // Who has mapped it goes on with it; who comes then finds nothing.
+        // Processes that have mapped it continue; new ones find nothing.
         run.processes(Role::Actor)
             .iter()
             .for_each(|actor| actor.signal(Signal::KILL));
@@ -138,46 +155,53 @@ fn a_run_whose_shared_memory_is_removed_makes_another() {
 fn a_copy_of_a_runs_directory_is_not_resumed_while_the_run_is_under_way() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(30);
+    run.until_episodes(30);
     let copies = tempfile::tempdir().unwrap();
     let copy = copies.path().join("copy");
-    // It complains of files that a living run replaces meanwhile, and copies the rest.
+    // cp complains about files that a live run replaces meanwhile, and copies the rest.
     let copied = Command::new("cp")
         .arg("-r")
         .arg(run.directory().root())
         .arg(&copy)
         .status();
     assert!(copied.is_ok(), "{copied:?}");
-    // Between two lives of the learner, too.
+    // The copy is refused even between two incarnations of the learner.
     run.process("skein-learner").signal(Signal::KILL);
-    let refused = run_program("skein", &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"]);
+    let refused = run_program(
+        "skein",
+        &["run", "--resume", copy.to_str().unwrap(), "--actors", "1"],
+    );
     refused.assert_refused(&["under way in another directory", "copy"]);
     run.finish().assert_same_as(&calm);
 }
 
 #[test]
-fn an_actor_that_was_frozen_too_long_is_not_mixed_in_when_it_wakes() {
+fn late_records_of_an_actor_frozen_too_long_are_refused() {
     let calm = calm();
     let mut run = recipe().set("transport.actor_silence_secs=0.5").start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let sleeper = run.processes(Role::Actor).remove(0);
     sleeper.signal(Signal::STOP);
-    // Whatever it was about to fly is flown by the other: else there would be no further epoch.
-    run.until_flights(30);
+    // The other actor flies its tickets; otherwise no further epoch would follow.
+    run.until_episodes(30);
     sleeper.signal(Signal::CONT);
     let disturbed = run.finish();
     disturbed.assert_same_as(&calm);
-    assert!(disturbed.summary().tickets_reissued > 0, "{:?}", disturbed.summary());
+    assert!(
+        disturbed.summary().tickets_reissued > 0,
+        "{:?}",
+        disturbed.summary()
+    );
 }
 
 #[test]
-fn a_frozen_learner_goes_on_where_it_was() {
+fn a_frozen_learner_continues_where_it_was() {
     let calm = calm();
     let mut run = recipe()
         .set("transport.learner_silence_secs=2")
         .set("transport.actor_silence_secs=1")
         .start();
-    run.until_flights(30);
+    run.until_episodes(30);
     let learner = run.process("skein-learner");
     learner.signal(Signal::STOP);
     // Longer than actors wait, so that all of them leave.
@@ -192,7 +216,7 @@ fn a_frozen_learner_goes_on_where_it_was() {
 fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
     let calm = calm();
     let mut run = recipe().actors(4).start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let learner = run.process("skein-learner");
     let end = Instant::now() + Duration::from_secs(6);
     while Instant::now() < end {
@@ -201,7 +225,10 @@ fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
         learner.signal(Signal::CONT);
         sleep(Duration::from_millis(5));
     }
-    assert!(learner.is_alive(), "it was over before it was slow");
+    assert!(
+        learner.is_alive(),
+        "the run ended before the learner was slowed down"
+    );
     let slowed = run.finish();
     slowed.assert_same_as(&calm);
     let summary = slowed.summary();
@@ -215,12 +242,12 @@ fn a_learner_slowed_down_ten_times_holds_the_actors_back_and_nothing_is_lost() {
 #[test]
 fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     let calm = calm();
-    // Far more than this machine has cores for: patience is all they need.
+    // More actors than this machine has cores for; long deadlines allow for that.
     let mut run = recipe()
         .actors(64)
         .set("transport.actor_silence_secs=60")
         .set("transport.learner_silence_secs=60")
-        .set("transport.flight_deadline_secs=600")
+        .set("transport.episode_deadline_secs=600")
         .start();
     let mut most = Footprint::default();
     let id = run.until("the run had an identity", |run| {
@@ -229,7 +256,7 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     run.until("all actors were there", |run| {
         let now = footprint(id);
         most.segment_bytes = most.segment_bytes.max(now.segment_bytes);
-        (run.processes(Role::Actor).len() == 64 && flights_begun(run)).then_some(())
+        (run.processes(Role::Actor).len() == 64 && episodes_begun(run)).then_some(())
     });
     let ended = run.finish();
     ended.assert_same_as(&calm);
@@ -242,8 +269,8 @@ fn sixty_four_actors_lose_nothing_and_take_bounded_memory() {
     assert!(most.segment_bytes < 64 * 5_200_000 + 64_000_000, "{most:?}");
 }
 
-fn flights_begun(run: &Running) -> bool {
-    !flights(run.directory()).is_empty()
+fn episodes_begun(run: &RunningRun) -> bool {
+    !episodes(run.directory()).is_empty()
 }
 
 #[test]
@@ -253,7 +280,7 @@ fn two_runs_side_by_side_never_meet() {
     let other = recipe().set("run.seed=2").start_beside(&one);
     let (one, other) = (one.finish(), other.finish());
     one.assert_same_as(&calm);
-    assert_eq!(other.flights().len(), 100);
+    assert_eq!(other.episodes().len(), 100);
     for run in [&one, &other] {
         let summary = run.summary();
         assert_eq!(
@@ -265,11 +292,14 @@ fn two_runs_side_by_side_never_meet() {
 }
 
 #[test]
-fn a_second_learner_of_a_run_is_refused_and_the_first_goes_on() {
+fn a_second_learner_of_a_run_is_refused_and_the_first_continues() {
     let calm = calm();
     let mut run = recipe().start();
-    run.until_flights(10);
-    let second = run_program("skein-learner", &["--run", run.directory().root().to_str().unwrap()]);
+    run.until_episodes(10);
+    let second = run_program(
+        "skein-learner",
+        &["--run", run.directory().root().to_str().unwrap()],
+    );
     second.assert_refused(&["another learner"]);
     run.finish().assert_same_as(&calm);
 }

@@ -1,37 +1,42 @@
-//! Training is a function of configuration and seed: who flies, how many fly, and who dies meanwhile, changes nothing.
+//! Training is a function of configuration and seed. The number of actors, the actor of an episode
+//! and deaths of actors change nothing.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 
 use rustix::process::Signal;
-use skein_protocol::run::RunDirectory;
-use skein_tests::{Ended, Process, Recipe, Role, processes_of};
+use skein_run::RunDirectory;
+use skein_tests::{EndedRun, ListedProcess, Role, RunRecipe, processes_of};
 
-/// The actors that flew training flights.
-fn crew(run: &Ended) -> BTreeSet<u32> {
-    run.flights().iter().map(|flight| flight.actor).collect()
+/// Returns the actors that flew training episodes.
+fn crew(run: &EndedRun) -> BTreeSet<u32> {
+    run.episodes().iter().map(|episode| episode.actor).collect()
 }
 
 #[test]
 fn one_two_and_four_actors_and_one_attached_half_way_learn_the_same_bit_for_bit() {
-    let alone = Recipe::smoke().actors(1).finish();
+    let alone = RunRecipe::smoke().actors(1).finish();
     for actors in [2, 4] {
-        let run = Recipe::smoke().actors(actors).finish();
+        let run = RunRecipe::smoke().actors(actors).finish();
         assert!(
             crew(&run).len() > 1,
-            "of {actors} actors only one flew: nothing was compared"
+            "of {actors} actors only one flew, so the test shows nothing"
         );
-        run.learned().assert_same(&alone.learned(), &format!("{actors} actors"));
+        run.learned()
+            .assert_same(&alone.learned(), &format!("{actors} actors"));
     }
-    let mut run = Recipe::smoke().actors(1).start();
-    run.until_flights(alone.flights().len() / 2);
+    let mut run = RunRecipe::smoke().actors(1).start();
+    run.until_episodes(alone.episodes().len() / 2);
     run.attach();
     let joined = run.finish();
     assert_eq!(
         crew(&joined),
         BTreeSet::from([0, 1]),
-        "the attached actor flew nothing: nothing was compared"
+        "the attached actor flew nothing, so the test shows nothing"
     );
     joined
         .learned()
@@ -39,21 +44,26 @@ fn one_two_and_four_actors_and_one_attached_half_way_learn_the_same_bit_for_bit(
 }
 
 #[test]
-fn actors_that_fly_while_the_learner_updates_change_nothing_either() {
-    let lagging = || Recipe::small().set("learning.policy_lag=1");
+fn actors_that_fly_during_updates_change_nothing() {
+    let lagging = || RunRecipe::small().set("learning.policy_lag=1");
     let alone = lagging().actors(1).finish();
     let together = lagging().actors(3).finish();
-    assert!(crew(&together).len() > 1, "only one actor flew: nothing was compared");
-    together.learned().assert_same(&alone.learned(), "three actors");
+    assert!(
+        crew(&together).len() > 1,
+        "only one actor flew, so the test shows nothing"
+    );
+    together
+        .learned()
+        .assert_same(&alone.learned(), "three actors");
 }
 
 #[test]
 fn an_actor_killed_in_the_middle_changes_nothing() {
-    // Long enough that the actor's second life falls into the run.
-    let long = || Recipe::small().set("run.flights=150");
+    // Long enough for the actor's second incarnation.
+    let long = || RunRecipe::small().set("run.episodes=150");
     let undisturbed = long().finish();
     let mut run = long().start();
-    run.until_flights(10);
+    run.until_episodes(10);
     let victim = actor(run.directory(), 0).unwrap();
     victim.signal(Signal::KILL);
     let successor = run.until("actor 0 was started again", |run| {
@@ -71,15 +81,15 @@ fn an_actor_killed_in_the_middle_changes_nothing() {
         .assert_same(&undisturbed.learned(), "an actor killed twice");
 }
 
-fn actor(run: &RunDirectory, id: u32) -> Option<Process> {
+fn actor(run: &RunDirectory, id: u32) -> Option<ListedProcess> {
     processes_of(run)
         .into_iter()
         .find(|process| process.role() == Role::Actor && process.actor() == Some(id))
 }
 
 #[test]
-fn another_seed_learns_something_else() {
-    let one = Recipe::small().set("run.seed=1").finish().learned();
-    let two = Recipe::small().set("run.seed=2").finish().learned();
+fn another_seed_has_another_result() {
+    let one = RunRecipe::small().set("run.seed=1").finish().learned();
+    let two = RunRecipe::small().set("run.seed=2").finish().learned();
     assert_ne!(one.policy_sha256(), two.policy_sha256());
 }

@@ -1,6 +1,10 @@
-//! `skein-evaluate` on a run's snapshot gives the numbers that the run itself gave, and records what it flew.
+//! `skein-evaluate` reproduces the numbers of a run from its snapshot, and records the flown
+//! episodes.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs::{self, File};
 use std::io::Read;
@@ -10,7 +14,7 @@ use std::process::Command;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::snapshot::Snapshot;
-use skein_tests::{Ended, Recipe, program, repository, run_program};
+use skein_tests::{EndedRun, RunRecipe, program, repository, run_program};
 
 /// Evaluates with `arguments` and returns the report.
 fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
@@ -25,7 +29,7 @@ fn evaluate(folder: &Path, arguments: &[&str]) -> EvaluationReport {
 
 #[test]
 fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
-    let run = Recipe::small().set("evaluation.flights=8").finish();
+    let run = RunRecipe::small().set("evaluation.episodes=8").finish();
     let in_the_run = run.evaluation();
     let directory = run.directory.root().to_str().unwrap();
     let best = run.directory.best_snapshot();
@@ -37,52 +41,66 @@ fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
     }
     let later = evaluate(folder.path(), &["--snapshot", best.to_str().unwrap()]);
     assert_eq!(later, in_the_run, "--snapshot");
-    let fewer = evaluate(folder.path(), &["--run", directory, "--flights", "3"]);
-    assert!(fewer.courses.iter().all(|course| course.flights == 3));
+    let fewer = evaluate(folder.path(), &["--run", directory, "--episodes", "3"]);
+    assert!(fewer.courses.iter().all(|course| course.episodes == 3));
 
-    a_recording_holds_every_step_of_every_flight(&run, 32, folder.path());
+    a_recording_holds_every_step_of_every_episode(&run, 32, folder.path());
 }
 
 #[test]
-fn a_code_of_another_length_is_learned_flown_and_recorded() {
+fn a_latent_code_of_another_length_is_learned_flown_and_recorded() {
     for latent in [8, 64] {
-        let run = Recipe::small()
+        let run = RunRecipe::small()
             .set(&format!("vae.latent={latent}"))
-            .set("evaluation.flights=8")
+            .set("evaluation.episodes=8")
             .finish();
         let summary = run.summary();
-        assert!(summary.vae_updates > 0 && summary.updates > 0, "{summary:?}");
+        assert!(
+            summary.vae_updates > 0 && summary.updates > 0,
+            "{summary:?}"
+        );
         let directory = run.directory.root().to_str().unwrap();
         let folder = tempfile::tempdir().unwrap();
         let later = evaluate(folder.path(), &["--run", directory]);
         assert_eq!(later, run.evaluation(), "{latent} numbers");
-        a_recording_holds_every_step_of_every_flight(&run, latent, folder.path());
+        a_recording_holds_every_step_of_every_episode(&run, latent, folder.path());
     }
 }
 
-/// Trained once and shipped: whatever changes since, it has to fly as its evaluation says.
+/// The shipped snapshot must still fly as its shipped evaluation states.
 #[test]
 fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     let folder = tempfile::tempdir().unwrap();
     let snapshots = repository().join("configs/snapshots");
     let said: EvaluationReport =
-        serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap()).unwrap();
+        serde_json::from_str(&fs::read_to_string(snapshots.join("generalist.json")).unwrap())
+            .unwrap();
     let (_, config) = Snapshot::load(&snapshots.join("generalist.safetensors")).unwrap();
     let shipped = Config::load(&repository().join("configs/generalist.toml"), &[]).unwrap();
     let mut differences = shipped.differences(&config.portable()).unwrap();
-    // The simulator's defaults, which the snapshot writes out and the file does not.
+    // The snapshot writes out the simulator's defaults; the file does not.
     differences.retain(|difference| !difference.ends_with("nothing here"));
     assert_eq!(differences, ["run.learner_threads = 1 there, 2 here"]);
 
-    // By a bare name, from where it lies.
+    // By a file name without folder, from its own folder.
     let json = folder.path().join("report.json");
     let output = Command::new(program("skein-evaluate"))
-        .args(["--snapshot", "generalist.safetensors", "--flights", "10", "--json"])
+        .args([
+            "--snapshot",
+            "generalist.safetensors",
+            "--episodes",
+            "10",
+            "--json",
+        ])
         .arg(&json)
         .current_dir(&snapshots)
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(
+        output.status.success(),
+        "{}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     let flown: EvaluationReport = serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
     assert_eq!(flown.policy_sha256, said.policy_sha256);
     assert_eq!(flown.courses.len(), config.courses.evaluation.len());
@@ -91,9 +109,9 @@ fn the_shipped_generalist_flies_courses_that_it_never_saw() {
     }
 }
 
-/// Read as NumPy documents its format, without any of our code.
-fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, folder: &Path) {
-    let file = folder.join("flights.npz");
+/// Reads the recording by NumPy's documentation of its format, without any of Skein's code.
+fn a_recording_holds_every_step_of_every_episode(run: &EndedRun, latent: usize, folder: &Path) {
+    let file = folder.join("episodes.npz");
     evaluate(
         folder,
         &[
@@ -107,7 +125,7 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
     let rows = closing.shape[0];
     for (name, kind, row) in [
         ("course", "<i4", &[][..]),
-        ("flight", "<i4", &[]),
+        ("episode", "<i4", &[]),
         ("step", "<i4", &[]),
         ("position_m", "<f4", &[3]),
         ("orientation", "<f4", &[4]),
@@ -115,7 +133,7 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
         ("depth", "|u1", &[72, 128]),
         ("latent", "<f4", &[latent]),
         ("action", "<f4", &[2]),
-        ("reward_terms", "<f4", &[4]),
+        ("reward_terms", "<f4", &[skein_protocol::REWARD_TERMS]),
         ("reward", "<f4", &[]),
         ("walls_passed", "|u1", &[]),
         ("terminated", "|u1", &[]),
@@ -128,12 +146,12 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
     let last = codes.words().skip(latent - 1).step_by(latent);
     assert!(
         last.map(f32::from_le_bytes).any(|number| number != 0.0),
-        "no code is as long as that"
+        "the largest code is implausible"
     );
-    let flights = closing.data.iter().filter(|&&closing| closing == 1).count();
-    assert_eq!(flights, 16, "eight flights on each of two courses");
+    let episodes = closing.data.iter().filter(|&&closing| closing == 1).count();
+    assert_eq!(episodes, 16, "eight episodes on each of two courses");
 
-    // The rewards of all flights on the first course are those of the report.
+    // The rewards of all episodes on the first course equal those of the report.
     let evaluation = run.evaluation();
     let (course, reward) = (array(&file, "course", "<i4"), array(&file, "reward", "<f4"));
     let total: f64 = course
@@ -143,7 +161,10 @@ fn a_recording_holds_every_step_of_every_flight(run: &Ended, latent: usize, fold
         .map(|(_, reward)| f64::from(f32::from_le_bytes(reward)))
         .sum();
     let reported = evaluation.courses[0].mean_return * 8.0;
-    assert!((total - reported).abs() < 1e-3, "recorded {total}, reported {reported}");
+    assert!(
+        (total - reported).abs() < 1e-3,
+        "recorded {total}, reported {reported}"
+    );
 }
 
 /// An array of a recording.
@@ -153,13 +174,17 @@ struct Array {
 }
 
 impl Array {
-    /// Its values of four bytes.
+    /// Returns its values, of four bytes each.
     fn words(&self) -> impl Iterator<Item = [u8; 4]> {
-        self.data.chunks_exact(4).map(|word| word.try_into().unwrap())
+        self.data
+            .chunks_exact(4)
+            .map(|word| word.try_into().unwrap())
     }
 }
 
-/// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary. Source: numpy.lib.format, version 1.0.
+/// Reads `name` from a `.npz` file: a zip of `.npy` files, whose header is a Python dictionary.
+///
+/// Source: numpy.lib.format, version 1.0.
 fn array(file: &Path, name: &str, kind: &str) -> Array {
     let mut zip = zip::ZipArchive::new(File::open(file).unwrap()).unwrap();
     let mut bytes = Vec::new();
@@ -170,8 +195,14 @@ fn array(file: &Path, name: &str, kind: &str) -> Array {
     assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00", "{name}");
     let data = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
     let header = std::str::from_utf8(&bytes[10..data]).unwrap();
-    assert!(header.contains(&format!("'descr': '{kind}'")), "{name}: {header}");
-    assert!(header.contains("'fortran_order': False"), "{name}: {header}");
+    assert!(
+        header.contains(&format!("'descr': '{kind}'")),
+        "{name}: {header}"
+    );
+    assert!(
+        header.contains("'fortran_order': False"),
+        "{name}: {header}"
+    );
     let (_, shape) = header.split_once("'shape': (").unwrap();
     let (shape, _) = shape.split_once(')').unwrap();
     let shape: Vec<usize> = shape

@@ -1,6 +1,10 @@
-//! An experiment from its file to its report: interrupted, gone on with, told, published, and refused once it is another.
+//! An experiment from its file to its report: interrupted, resumed, reported, published, and
+//! refused after changes.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,18 +13,20 @@ use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_launch::inspection::compare;
+use skein_chaos::compare;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::run::RunDirectory;
-use skein_protocol::summary::{Ending, Summary};
-use skein_tests::{Output, Recipe, flights, leftovers, program, repository, run_program};
+use skein_protocol::summary::RunEnding;
+use skein_run::RunDirectory;
+use skein_tests::{
+    ProgramOutput, RunRecipe, episodes, leftovers, program, repository, run_program,
+};
 
-/// An experiment of four runs takes a tenth of it on an idle machine.
+/// Time limit. On an idle machine, an experiment of four runs takes a tenth of it.
 const LIMIT: Duration = Duration::from_secs(300);
-/// Beside `tests/small.toml`, in both arms.
-const SETTINGS: [&str; 2] = ["run.flights=60", "evaluation.window_flights=10"];
+/// Settings of both arms beyond `tests/small.toml`.
+const SETTINGS: [&str; 2] = ["run.episodes=60", "evaluation.window_episodes=10"];
 
-/// A repository with one experiment, and no other content than it needs.
+/// A repository with one experiment and its inputs.
 struct Scene {
     folder: tempfile::TempDir,
 }
@@ -32,29 +38,31 @@ impl Scene {
         };
         fs::create_dir_all(scene.path("configs/experiments")).unwrap();
         scene.write_suite(5);
-        fs::write(scene.path("RESULTS.md"), "# Results\n\nBefore.\n").unwrap();
         scene.write("0.5");
         scene
     }
 
-    /// Writes the experiment's file, whose second arm has this share of success experience.
+    /// Writes the experiment's file, with this share of success experience in the second arm.
     fn write(&self, share: &str) {
         let base = repository().join("tests/small.toml");
         let text = format!(
-            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\ntables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\n\
-             curves = [{{ measure = \"walls_passed\", over = \"flights\" }}]\nsettings.run.flights = 60\nsettings.evaluation.window_flights = 10\n\
-             [[arm]]\nname = \"one-part\"\nlabel = \"one part\"\nsettings.replay.success_share = 0.0\n\
-             [[arm]]\nname = \"half\"\nlabel = \"half\"\nsettings.replay.success_share = {share}\n"
+            "question = \"What for?\"\nbase = {base:?}\nseeds = 2\nsuite = \"../few.toml\"\n\
+             tables = [\"evaluation\", \"outcomes\", \"suite\", \"learning\", \"cost\"]\ncurves = \
+             [{{ measure = \"walls_passed\", over = \"episodes\" }}]\nsettings.run.episodes = 60\n\
+             settings.evaluation.window_episodes = 10\n[[arm]]\nname = \"one-part\"\nlabel = \
+             \"one part\"\nsettings.replay.success_share = 0.0\n[[arm]]\nname = \"half\"\nlabel = \
+             \"half\"\nsettings.replay.success_share = {share}\n"
         );
         fs::write(self.path("configs/experiments/tiny.toml"), text).unwrap();
     }
 
-    /// Writes the experiment's suite: this many flights of each entry.
-    fn write_suite(&self, flights: u64) {
+    /// Writes the experiment's suite, with this many episodes per entry.
+    fn write_suite(&self, episodes: u64) {
         let course = repository().join("configs/courses/training.toml");
         let text = format!(
-            "name = \"few\"\nflights = {flights}\n[[entry]]\nname = \"as it is\"\ncourse = {course:?}\n\
-             [[entry]]\nname = \"in any order\"\norders_of = {course:?}\ndisturbances.latency_periods = 1\n"
+            "name = \"few\"\nepisodes = {episodes}\n[[entry]]\nname = \"as it is\"\ncourse = \
+             {course:?}\n[[entry]]\nname = \"in any order\"\norders_of = {course:?}\n\
+             disturbances.latency_periods = 1\n"
         );
         fs::write(self.path("configs/few.toml"), text).unwrap();
     }
@@ -67,23 +75,24 @@ impl Scene {
         RunDirectory::new(self.path(&format!("runs/experiments/tiny/{arm}/seed-{seed}")))
     }
 
-    fn results(&self) -> String {
-        fs::read_to_string(self.path("RESULTS.md")).unwrap()
+    /// The published document.
+    fn document(&self) -> String {
+        fs::read_to_string(self.path("docs/results/tiny.md")).unwrap()
     }
 
     fn arguments(&self, more: &[&str]) -> Vec<String> {
         let repository = self.path("").display().to_string();
-        let all = ["--repository", repository.as_str(), "tiny"];
+        let all = ["experiment", "--repository", repository.as_str(), "tiny"];
         all.iter().chain(more).map(ToString::to_string).collect()
     }
 
-    /// Runs it to its end.
-    fn finish(&self, more: &[&str]) -> Output {
-        run_program("skein-experiment", &self.arguments(more))
+    /// Runs the experiment to its end.
+    fn finish(&self, more: &[&str]) -> ProgramOutput {
+        run_program("skein", &self.arguments(more))
     }
 
     fn start(&self) -> Child {
-        Command::new(program("skein-experiment"))
+        Command::new(program("skein"))
             .args(self.arguments(&[]))
             .stdin(Stdio::null())
             .stdout(Stdio::null())
@@ -105,11 +114,12 @@ fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 }
 
 fn completed(run: &RunDirectory) -> bool {
-    Summary::of(run).is_some_and(|summary| summary.ending == Ending::Completed)
+    run.summary()
+        .is_some_and(|summary| summary.ending == RunEnding::Completed)
 }
 
 #[test]
-fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
+fn an_experiment_is_interrupted_resumed_reported_and_published() {
     let scene = Scene::new();
     let runs: Vec<_> = [1, 2]
         .iter()
@@ -117,46 +127,57 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
         .collect();
 
     let mut experiment = scene.start();
-    until("the first run has flights", || {
-        (flights(&runs[0]).len() >= 20).then_some(())
+    until("the first run has episodes", || {
+        (episodes(&runs[0]).len() >= 20).then_some(())
     });
-    kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
+    kill_process(
+        Pid::from_raw(experiment.id().cast_signed()).unwrap(),
+        Signal::INT,
+    )
+    .unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
     assert_eq!(status.code(), Some(130));
-    assert!(!runs.iter().all(completed), "nothing was left to go on with");
+    assert!(
+        !runs.iter().all(completed),
+        "all runs were complete before the interruption"
+    );
     for run in &runs {
-        assert!(leftovers(run).is_empty(), "left behind: {:?}", leftovers(run));
+        assert!(
+            leftovers(run).is_empty(),
+            "left behind: {:?}",
+            leftovers(run)
+        );
     }
 
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert!(runs.iter().all(completed));
-    assert_eq!(
-        scene.results(),
-        "# Results\n\nBefore.\n",
-        "nothing is published unasked"
+    assert!(
+        !scene.path("docs").exists(),
+        "nothing is published without --publish"
     );
     let report = scene.path("runs/experiments/tiny/report");
     let text = fs::read_to_string(report.join("report.md")).unwrap();
     assert!(output.stdout.contains(text.trim_end()));
     for part in [
-        "**What for?**",
+        "# What for?",
         "| one part |",
         "`replay.success_share=0.0`",
-        "non_rectangular",
-        "flew the suite `few.toml`",
-        "| in any order |     2 |       5 |",
+        "non-rectangular",
+        "The best snapshot in the suite `few.toml`",
+        "| in any order |     2 |        5 |",
         "| hit wall 1, 2, … | hit the corridor before 1, …, end | timed out before 1, …, end |",
-        "How the flights of the suite `few.toml` went",
+        "How the episodes of the suite `few.toml` ended",
         "2 seeds an arm",
     ] {
         assert!(text.contains(part), "`{part}` is missing in\n{text}");
     }
-    let picture = fs::read(report.join("walls_passed_over_flights.png")).unwrap();
+    let picture = fs::read(report.join("walls_passed_over_episodes.png")).unwrap();
     assert!(picture.starts_with(b"\x89PNG"));
 
-    // What was interrupted came to the same as a run of a user who set the same and was left in peace.
-    let mut alone = Recipe::small()
+    // The interrupted run has the same results as an uninterrupted run that a user starts with the
+    // same settings.
+    let mut alone = RunRecipe::small()
         .set("replay.success_share=0.0")
         .set("run.learner_threads=1");
     for setting in SETTINGS {
@@ -174,11 +195,18 @@ fn an_experiment_is_interrupted_gone_on_with_told_and_published() {
 }
 
 #[test]
-fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
+fn an_invalid_experiment_does_not_hide_the_others() {
     let scene = Scene::new();
-    fs::write(scene.path("configs/experiments/broken.toml"), "question = 1\n").unwrap();
+    fs::write(
+        scene.path("configs/experiments/broken.toml"),
+        "question = 1\n",
+    )
+    .unwrap();
     let repository = scene.path("").display().to_string();
-    let output = run_program("skein-experiment", &["--repository", &repository, "--list"]);
+    let output = run_program(
+        "skein",
+        &["experiment", "--repository", &repository, "--list"],
+    );
     assert_eq!(output.code, Some(1));
     assert!(
         output.stdout.contains("tiny") && output.stdout.contains("What for?"),
@@ -186,46 +214,57 @@ fn an_experiment_that_cannot_be_run_does_not_hide_the_others() {
         output.stdout
     );
     assert!(
-        output.stderr.contains("broken.toml is no experiment"),
+        output.stderr.contains("broken.toml is not an experiment"),
         "{}",
         output.stderr
     );
 }
 
-/// Telling it again runs nothing, gives the same report, and replaces what was published before.
+/// A repeated report runs nothing, is identical, and replaces the published one.
 fn assert_published(scene: &Scene, report: &str) {
-    for _ in 0..2 {
+    for answer in ["Because.\n", ""] {
         let output = scene.finish(&["--report", "--publish"]);
         assert_eq!(output.code, Some(0), "{}", output.stderr);
+        let answered = scene
+            .document()
+            .replace("<!-- report", &format!("{answer}<!-- report"));
+        fs::write(scene.path("docs/results/tiny.md"), answered).unwrap();
     }
-    let results = scene.results();
-    assert!(results.starts_with("# Results\n\nBefore.\n\n## Experiment: tiny\n\n<!-- experiment: tiny -->\n"));
-    assert_eq!(results.matches("<!-- end -->").count(), 1);
-    let picture = "launch/pictures/experiments/tiny_walls_passed_over_flights.png";
-    assert!(results.contains(picture) && scene.path(picture).is_file());
-    let lines = fs::read_to_string(scene.path("launch/pictures/experiments/tiny_runs.csv")).unwrap();
+    let document = scene.document();
+    assert!(
+        document.starts_with("# What for?\n\nBecause.\n<!-- report -->\n"),
+        "{document}"
+    );
+    assert_eq!(document.matches("<!-- end -->").count(), 1);
+    let picture = "pictures/tiny_walls_passed_over_episodes.png";
+    let folder = scene.path("docs/results");
+    assert!(document.contains(picture) && folder.join(picture).is_file());
+    let lines = fs::read_to_string(folder.join("runs/tiny.csv")).unwrap();
     for (arm, seed) in [("one-part", 1), ("half", 1), ("one-part", 2), ("half", 2)] {
-        let learned = Summary::of(&scene.run(arm, seed)).unwrap().policy_sha256;
-        let line = lines.lines().find(|line| line.starts_with(&format!("{arm},{seed},")));
+        let learned = scene.run(arm, seed).summary().unwrap().policy_sha256;
+        let line = lines
+            .lines()
+            .find(|line| line.starts_with(&format!("{arm},{seed},")));
         assert!(line.is_some_and(|line| line.contains(&learned)), "{lines}");
     }
-    let published = results.replace("launch/pictures/experiments/tiny_", "");
-    assert!(published.contains(report.trim_end()), "{published}\n---\n{report}");
-    // Not while another is being published.
-    let pictures = fs::File::open(scene.path("launch/pictures/experiments")).unwrap();
-    pictures.lock().unwrap();
-    let output = scene.finish(&["--report", "--publish"]);
-    output.assert_refused(&["another experiment is being published"]);
-    drop(pictures);
-    // A part of it is no result to replace that by.
-    for part in [["--seeds", "1"], ["--flights", "20"]] {
+    let published = document
+        .replace("(pictures/tiny_", "(")
+        .replace("runs/tiny.csv", "runs.csv");
+    let (heading, body) = report.split_once("\n\n").unwrap();
+    let (body, _) = body.split_once("\n\nHow to read").unwrap();
+    assert!(
+        heading == "# What for?" && published.contains(body),
+        "{published}\n---\n{report}"
+    );
+    // An incomplete experiment must not replace a complete one.
+    for part in [["--seeds", "1"], ["--episodes", "20"]] {
         let output = scene.finish(&[&part[..], &["--report", "--publish"]].concat());
         output.assert_refused(&["--publish", "2 seeds"]);
-        assert_eq!(scene.results(), results);
+        assert_eq!(scene.document(), document);
     }
 }
 
-/// What came of the suites of a run.
+/// Returns the suite results of a run.
 fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
     let folder = run.suite_json("any");
     let entries = fs::read_dir(folder.parent().unwrap()).unwrap();
@@ -234,10 +273,12 @@ fn suite_results(run: &RunDirectory) -> Vec<PathBuf> {
     results
 }
 
-/// A run that is trained flies its suite and nothing else, whatever kept it from that before: it failed, was interrupted, or is another suite now.
+/// Asserts that a trained run only flies its suite, whether the suite failed before, was
+/// interrupted, or has changed.
 fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let files = |run: &RunDirectory| {
-        [run.summary_json(), run.flights_csv()].map(|file| fs::metadata(file).unwrap().modified().unwrap())
+        [run.summary_json(), run.episodes_csv()]
+            .map(|file| fs::metadata(file).unwrap().modified().unwrap())
     };
     let before: Vec<_> = runs.iter().map(files).collect();
     let result = suite_results(&runs[1]).pop().unwrap();
@@ -246,11 +287,11 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let entries: Vec<_> = report
         .courses
         .iter()
-        .map(|entry| (entry.course.as_str(), entry.flights))
+        .map(|entry| (entry.course.as_str(), entry.episodes))
         .collect();
     assert_eq!(entries, [("as it is", 5), ("in any order", 5)]);
 
-    // It fails, as a run does.
+    // A suite may fail, like a run.
     fs::remove_file(&result).unwrap();
     let snapshots = [runs[1].snapshots(), runs[1].root().join("aside")];
     fs::rename(&snapshots[0], &snapshots[1]).unwrap();
@@ -258,7 +299,7 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     assert_eq!(output.code, Some(1), "{}", output.stderr);
     for part in [
         "4 runs of 2 arms with 2 seeds each, 3 complete already, 1 trained already",
-        "half/seed-1 failed: its `skein-evaluate` exited with status 1",
+        "half/seed-1 failed: its `skein evaluate` exited with status 1",
         "holds neither snapshots/best.safetensors",
         "the same command tries them again",
     ] {
@@ -268,30 +309,46 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
             output.stderr
         );
     }
-    assert!(output.stdout.contains("**Not all of it**: 3 of 4 runs are complete."));
+    assert!(
+        output
+            .stdout
+            .contains("**Incomplete**: 3 of 4 runs are complete.")
+    );
     fs::rename(&snapshots[1], &snapshots[0]).unwrap();
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert!(
-        output.stderr.contains("half/seed-1 is complete: it completed "),
+        output
+            .stderr
+            .contains("half/seed-1 is complete: it completed "),
         "{}",
         output.stderr
     );
-    assert!(!output.stderr.contains("half/seed-1 is trained"), "{}", output.stderr);
+    assert!(
+        !output.stderr.contains("half/seed-1 is trained"),
+        "{}",
+        output.stderr
+    );
     assert_eq!(
         fs::read(&result).unwrap(),
         flown,
-        "the same flights came to something else"
+        "the same episodes have other results"
     );
 
-    // Another suite of the same name, too long to be flown to its end, is interrupted; the results of the first are as good as they were.
+    // Interrupts another suite of the same name, too long to complete. The results of the first
+    // stay valid.
     scene.write_suite(1_000_000);
     let mut experiment = scene.start();
     until("a suite is flown", || {
         let said = fs::read_to_string(runs[0].root().with_extension("log")).unwrap();
-        said.contains("1000000 flights on each of 2 entries").then_some(())
+        said.contains("1000000 episodes on each of 2 entries")
+            .then_some(())
     });
-    kill_process(Pid::from_raw(experiment.id().cast_signed()).unwrap(), Signal::INT).unwrap();
+    kill_process(
+        Pid::from_raw(experiment.id().cast_signed()).unwrap(),
+        Signal::INT,
+    )
+    .unwrap();
     let status = until("the experiment stops", || experiment.try_wait().unwrap());
     assert_eq!(status.code(), Some(130));
     scene
@@ -301,51 +358,65 @@ fn assert_only_the_suite_is_flown_again(scene: &Scene, runs: &[RunDirectory]) {
     let output = scene.finish(&["--report"]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     assert_eq!(suite_results(&runs[1]), [result]);
-    assert_eq!(runs.iter().map(files).collect::<Vec<_>>(), before, "trained again");
+    assert_eq!(
+        runs.iter().map(files).collect::<Vec<_>>(),
+        before,
+        "trained again"
+    );
 }
 
-/// And that is another result, beside the suite's own.
+/// A different number of episodes is another result, beside the suite's own.
 fn assert_a_suite_is_flown_as_often_as_the_experiment_says(scene: &Scene, runs: &[RunDirectory]) {
     let file = scene.path("configs/experiments/tiny.toml");
     let text = fs::read_to_string(&file).unwrap();
-    fs::write(&file, format!("suite_flights = 2\n{text}")).unwrap();
+    fs::write(&file, format!("suite_episodes = 2\n{text}")).unwrap();
     let output = scene.finish(&[]);
     assert_eq!(output.code, Some(0), "{}", output.stderr);
     for run in runs {
         let results = suite_results(run);
         let flown = |result: &PathBuf| -> Vec<u64> {
-            let report: EvaluationReport = serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
-            report.courses.iter().map(|entry| entry.flights).collect()
+            let report: EvaluationReport =
+                serde_json::from_slice(&fs::read(result).unwrap()).unwrap();
+            report.courses.iter().map(|entry| entry.episodes).collect()
         };
         assert_eq!(
-            results.iter().filter(|result| flown(result) == [2, 2]).count(),
+            results
+                .iter()
+                .filter(|result| flown(result) == [2, 2])
+                .count(),
             1,
             "{results:?}"
         );
         assert_eq!(
-            results.iter().filter(|result| flown(result) == [5, 5]).count(),
+            results
+                .iter()
+                .filter(|result| flown(result) == [5, 5])
+                .count(),
             1,
             "{results:?}"
         );
     }
 }
 
-/// What was learned from another configuration is never mixed with what the file says now, and never removed.
+/// Asserts that runs with another configuration than the file's are never mixed with its runs, and
+/// never removed.
 fn assert_refused_when_changed(scene: &Scene) {
     scene.write("0.25");
     for arguments in [&[][..], &["--report"]] {
         let changed = scene.run("half", 1);
         let directory = changed.root().display().to_string();
-        scene
-            .finish(arguments)
-            .assert_refused(&[&directory, "replay.success_share = 0.5 there, 0.25 here", "mv "]);
+        scene.finish(arguments).assert_refused(&[
+            &directory,
+            "replay.success_share = 0.5 there, 0.25 here",
+            "mv ",
+        ]);
         assert!(completed(&changed));
     }
     scene
-        .finish(&["--flights", "60"])
-        .assert_refused(&["tiny.toml", "--flights = 60 shortens nothing"]);
-    let nothing: &Path = &scene.path("runs/experiments/tiny_20_flights");
+        .finish(&["--episodes", "60"])
+        .assert_refused(&["tiny.toml", "--episodes = 60 does not shorten the run"]);
+    let nothing: &Path = &scene.path("runs/experiments/tiny_20_episodes");
     scene
-        .finish(&["--flights", "20", "--report"])
+        .finish(&["--episodes", "20", "--report"])
         .assert_refused(&["no run in", &nothing.display().to_string()]);
 }

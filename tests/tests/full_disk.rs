@@ -1,18 +1,21 @@
-//! A disk that fills up pauses a run, and costs nothing but time.
+//! A full disk pauses a run and costs nothing but time.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use skein_tests::Recipe;
+use skein_tests::RunRecipe;
 use tempfile::TempDir;
 
-/// A file system of its own, in memory.
+/// A separate file system in memory.
 struct SmallDisk(TempDir);
 
 impl SmallDisk {
-    /// One of this size; `None` where this user may not mount any.
+    /// Mounts one of this size; `None` if this user may not mount.
     fn of(size: &str) -> Option<Self> {
         let disk = Self(tempfile::tempdir().unwrap());
         disk.mount(&format!("size={size}")).then_some(disk)
@@ -38,33 +41,34 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        // Lazily: whatever a test that failed has left there may still be open.
+        // Lazily, because a failed test may have left open files.
         let _ = Command::new("umount").arg("-l").arg(self.folder()).status();
     }
 }
 
-/// Starts a run on a disk of this `size`, makes room when the user is told that there is none, and requires that nothing else has come of it.
-fn waits_for_room_and_comes_to_the_same(size: &str) {
+/// Starts a run on a disk of this `size`, makes room once the full disk is reported, and asserts
+/// that the result is unchanged.
+fn assert_a_full_disk_only_delays(size: &str) {
     let Some(disk) = SmallDisk::of(size) else {
         eprintln!("skipped: this user may not mount a file system");
         return;
     };
-    let mut run = Recipe::small().within(disk.folder()).start();
-    run.until("it was told that the disk is full", |run| {
+    let mut run = RunRecipe::small().within(disk.folder()).start();
+    run.until("the full disk was reported", |run| {
         run.stderr()
-            .contains("nothing moves: waits for room on the disk")
+            .contains("no progress: waiting for room on the disk")
             .then_some(())
     });
     disk.resize("1g");
-    run.finish().assert_same_as(&Recipe::small().finish());
+    run.finish().assert_same_as(&RunRecipe::small().finish());
 }
 
 #[test]
 fn a_run_whose_disk_fills_up_waits_for_room() {
-    waits_for_room_and_comes_to_the_same("600k");
+    assert_a_full_disk_only_delays("600k");
 }
 
 #[test]
-fn a_run_whose_disk_is_full_from_the_first_file_of_its_learner_waits_for_room() {
-    waits_for_room_and_comes_to_the_same("24k");
+fn a_run_whose_disk_is_full_from_the_start_waits_for_room() {
+    assert_a_full_disk_only_delays("24k");
 }

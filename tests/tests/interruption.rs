@@ -1,21 +1,28 @@
-//! How a run ends before its time: in order, at once, or with its supervisor; and that nothing is left behind.
+//! Early ends of a run: in order, immediately, or with its supervisor. Nothing is left behind.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
+use std::fs::OpenOptions;
+use std::process::Command;
+use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::summary::Ending;
-use skein_tests::{Recipe, Running, leftovers, processes_of};
+use skein_protocol::summary::RunEnding;
+use skein_run::RunDirectory;
+use skein_tests::{RunRecipe, RunningRun, episodes, leftovers, processes_of, program, repository};
 
-/// What a shell reports of a program that Ctrl-C ended: 128 + SIGINT.
+/// Exit status that a shell reports for a program ended by Ctrl-C: 128 + SIGINT.
 const INTERRUPTED: i32 = 130;
 
-/// A run that would go on for hours, some way into it.
-fn long_run() -> Running {
-    let mut run = Recipe::small().set("run.flights=1000000").start();
-    run.until_flights(20);
+/// Starts a run of many hours and lets it proceed a little.
+fn long_run() -> RunningRun {
+    let mut run = RunRecipe::small().set("run.episodes=1000000").start();
+    run.until_episodes(20);
     run
 }
 
@@ -24,24 +31,32 @@ fn the_first_interruption_saves_everything_learned() {
     let run = long_run();
     run.signal(Signal::INT);
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     ended.assert_nothing_is_left();
 
     let summary = ended.summary();
-    assert_eq!(summary.ending, Ending::Interrupted);
-    assert!(summary.flights >= 20 && summary.updates > 0, "{summary:?}");
+    assert_eq!(summary.ending, RunEnding::Interrupted);
+    assert!(summary.episodes >= 20 && summary.updates > 0, "{summary:?}");
     let (latest, _) = Snapshot::load(&ended.directory.latest_snapshot()).unwrap();
     assert_eq!(latest.sha256(), summary.policy_sha256);
     assert_eq!(
-        ended.flights().len() as u64,
-        summary.flights,
-        "flights that were not learned from are listed, or the reverse"
+        ended.episodes().len() as u64,
+        summary.episodes,
+        "the listed episodes are not those learned from"
     );
     let checkpoint = ended
         .directory
         .checkpoints()
-        .join(format!("flight-{}", summary.flights));
-    assert!(checkpoint.join("manifest.json").is_file(), "no {checkpoint:?}");
+        .join(format!("episode-{}", summary.episodes));
+    assert!(
+        checkpoint.join("manifest.json").is_file(),
+        "no {checkpoint:?}"
+    );
     for plot in ["return.png", "walls_passed.png"] {
         assert!(
             ended.directory.plots().join(plot).is_file(),
@@ -56,20 +71,28 @@ fn the_first_interruption_saves_everything_learned() {
 }
 
 #[test]
-fn the_second_interruption_ends_the_run_at_once() {
+fn the_second_interruption_ends_the_run_immediately() {
     let mut run = long_run();
-    // A learner that cannot stop in order, now or ever.
+    // A frozen learner cannot stop in order.
     let processes = processes_of(run.directory());
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::STOP);
     run.signal(Signal::INT);
-    run.until("the first interruption was heeded", |run| {
-        run.stderr().contains("stopping in order").then_some(())
+    run.until("the first interruption was handled", |run| {
+        run.stderr().contains("stopping: finishing").then_some(())
     });
     run.signal(Signal::INT);
     let begun = Instant::now();
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     ended.assert_nothing_is_left();
     assert!(
         begun.elapsed() < Duration::from_secs(10),
@@ -85,14 +108,17 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
     let directory = run.directory().clone();
     let processes = processes_of(&directory);
     assert_eq!(processes.len(), 4, "supervisor, learner, two actors");
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::STOP);
     run.signal(Signal::KILL);
     let begun = Instant::now();
     while !processes_of(&directory).is_empty() {
         assert!(
             begun.elapsed() < Duration::from_secs(5),
-            "still there: {:?}",
+            "still running: {:?}",
             leftovers(&directory)
         );
         std::thread::sleep(Duration::from_millis(10));
@@ -100,19 +126,27 @@ fn no_process_outlives_a_killed_supervisor_not_even_a_frozen_one() {
 }
 
 #[test]
-fn a_run_between_two_lives_of_its_learner_stops_in_order() {
+fn a_run_between_two_incarnations_of_its_learner_stops_in_order() {
     let mut run = long_run();
     let processes = processes_of(run.directory());
-    let learner = processes.iter().find(|process| process.runs("skein-learner")).unwrap();
+    let learner = processes
+        .iter()
+        .find(|process| process.runs("skein-learner"))
+        .unwrap();
     learner.signal(Signal::KILL);
-    run.until("the learner was started again", |run| {
+    run.until("the learner was restarted", |run| {
         run.stderr()
-            .contains("the learner was killed by signal 9; it is started again at once")
+            .contains("the learner was killed by signal 9; restarting it now")
             .then_some(())
     });
     run.signal(Signal::INT);
     let ended = run.wait();
-    assert_eq!(ended.output.code, Some(INTERRUPTED), "{}", ended.output.stderr);
+    assert_eq!(
+        ended.output.code,
+        Some(INTERRUPTED),
+        "{}",
+        ended.output.stderr
+    );
     let last = ended.output.stderr.lines().last().unwrap_or_default();
     assert!(
         last.ends_with(&format!(
@@ -122,4 +156,80 @@ fn a_run_between_two_lives_of_its_learner_stops_in_order() {
         "{last}"
     );
     ended.assert_nothing_is_left();
+}
+
+/// As `nohup skein run … >/dev/full 2>&1 &` in a script, whose terminal then closes.
+#[test]
+fn a_run_whose_terminal_is_lost_completes_and_ignored_signals_stay_ignored() {
+    let folder = tempfile::tempdir().unwrap();
+    let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
+    let full = || OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let mut supervisor = Command::new("sh")
+        .args(["-c", "trap '' HUP INT TERM; exec \"$@\"", "sh"])
+        .arg(program("skein"))
+        .args(["run", "--actors", "1", "--config"])
+        .arg(repository().join("tests/small.toml"))
+        .arg("--run-dir")
+        .arg(directory.root())
+        .stdout(full())
+        .stderr(full())
+        .spawn()
+        .unwrap();
+    let deadline = Instant::now() + Duration::from_secs(120);
+    while episodes(&directory).len() < 10 {
+        assert!(Instant::now() < deadline, "never ten episodes");
+        assert_eq!(supervisor.try_wait().unwrap(), None, "the run ended");
+        sleep(Duration::from_millis(20));
+    }
+    let pid = Pid::from_raw(supervisor.id().cast_signed()).unwrap();
+    for signal in [Signal::HUP, Signal::INT, Signal::TERM] {
+        kill_process(pid, signal).unwrap();
+    }
+    assert!(supervisor.wait().unwrap().success());
+    let summary = directory.summary().unwrap();
+    assert_eq!(summary.ending, RunEnding::Completed);
+    assert!(directory.evaluation_json().is_file());
+}
+
+/// As Ctrl-Z, and later fg. The processes of the run are not stopped: each leads its own group.
+#[test]
+fn a_supervisor_stopped_for_longer_than_its_deadlines_continues_where_it_was() {
+    let mut run = RunRecipe::small()
+        .set("run.episodes=1000000")
+        .set("transport.learner_silence_secs=6")
+        .start();
+    run.until_episodes(10);
+    run.signal(Signal::STOP);
+    // Longer than the 5 s after which it takes a silent learner for frozen.
+    sleep(Duration::from_secs(7));
+    run.signal(Signal::CONT);
+    let flown = episodes(run.directory()).len();
+    run.until_episodes(flown + 20);
+    run.signal(Signal::INT);
+    let ended = run.wait();
+    assert_eq!(ended.output.code, Some(INTERRUPTED));
+    for blame in ["killing it", "restarting", "found no learner"] {
+        assert!(
+            !ended.output.stderr.contains(blame),
+            "{}",
+            ended.output.stderr
+        );
+    }
+}
+
+#[test]
+fn a_run_whose_directory_is_removed_says_so() {
+    let run = long_run();
+    // Moved, not removed: that is done at once, whatever the processes create meanwhile.
+    let root = run.directory().root();
+    std::fs::rename(root, root.with_extension("moved")).unwrap();
+    let ended = run.wait();
+    ended
+        .output
+        .assert_refused(&["was removed", "start a new run"]);
+    assert!(
+        !ended.output.stderr.contains("--resume"),
+        "{}",
+        ended.output.stderr
+    );
 }

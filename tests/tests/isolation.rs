@@ -1,6 +1,9 @@
-//! A run is its user's alone, and on its machine alone.
+//! A run is accessible only to its user, and only on its machine.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,9 +12,9 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use skein_tests::{Recipe, Running, processes_of, program};
+use skein_tests::{RunRecipe, RunningRun, processes_of, program};
 
-/// `nobody`, by convention; that the user has an account is not needed.
+/// Id of the user `nobody`, by convention; no account is needed.
 const OTHER_USER: u32 = 65534;
 
 /// Runs `program` as the other user.
@@ -25,7 +28,7 @@ fn as_other_user(program: &Path, arguments: &[&Path]) -> Output {
         .unwrap()
 }
 
-/// Whether the other user's shell could do `action` to `path`, its first parameter.
+/// Returns `true` if the other user's shell can do `action` to `path`, its first parameter.
 fn other_user_can(action: &str, path: &Path) -> bool {
     let shell = [Path::new("-c"), Path::new(action), Path::new("sh"), path];
     as_other_user(Path::new("/bin/sh"), &shell).status.success()
@@ -39,11 +42,11 @@ fn set_mode(path: &Path, mode: u32) {
     fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
 }
 
-/// A run that flies, in a folder that everybody may enter.
-fn flying_run() -> Running {
-    let mut run = Recipe::small().set("run.flights=100").start();
+/// Starts a run in a folder that all users may enter, and waits until it flies.
+fn flying_run() -> RunningRun {
+    let mut run = RunRecipe::small().set("run.episodes=100").start();
     set_mode(run.directory().root().parent().unwrap(), 0o755);
-    run.until_flights(10);
+    run.until_episodes(10);
     run
 }
 
@@ -64,32 +67,53 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     fs::write(&open, "x").unwrap();
     set_mode(&open, 0o666);
     for action in [READ, WRITE] {
-        assert!(other_user_can(action, &open), "nothing could be shown if this failed");
+        assert!(
+            other_user_can(action, &open),
+            "without this the test shows nothing"
+        );
     }
 
     let segments: Vec<PathBuf> = fs::read_dir("/dev/shm")
         .unwrap()
         .map(|entry| entry.unwrap().path())
-        .filter(|path| path.file_name().unwrap().to_str().unwrap().starts_with(&segment_prefix))
+        .filter(|path| {
+            path.file_name()
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .starts_with(&segment_prefix)
+        })
         .collect();
     assert!(segments.len() > 10, "{segments:?}");
     let files = [
         run.directory().identity(),
         run.directory().config(),
-        run.directory().flights_csv(),
-        identity.transport_folder().join("life"),
+        run.directory().episodes_csv(),
+        identity.transport_folder().join("incarnation"),
         identity.transport_folder().join("learner.lock"),
     ];
     for path in segments.iter().chain(&files) {
-        // What an actor that has gone took with it, nobody can read.
-        assert!(!other_user_can(READ, path), "{} can be read", path.display());
-        assert!(!other_user_can(WRITE, path), "{} can be written", path.display());
+        // Files that an actor has removed cannot be read.
+        assert!(
+            !other_user_can(READ, path),
+            "{} can be read",
+            path.display()
+        );
+        assert!(
+            !other_user_can(WRITE, path),
+            "{} can be written",
+            path.display()
+        );
     }
     for folder in [run.directory().root(), &identity.transport_folder()] {
-        assert!(!other_user_can(LIST, folder), "{} can be listed", folder.display());
+        assert!(
+            !other_user_can(LIST, folder),
+            "{} can be listed",
+            folder.display()
+        );
     }
 
-    // With everything about the run that there is to know, short of being its user.
+    // The other user has all information about the run.
     let copy = everybodys.path().join("copy");
     let actor = everybodys.path().join("skein-actor");
     let copied = Command::new("cp")
@@ -106,10 +130,13 @@ fn another_user_can_neither_read_nor_write_nor_join() {
     assert!(given.unwrap().success());
     fs::copy(program("skein-actor"), &actor).unwrap();
     chown(&actor, Some(OTHER_USER), None).unwrap();
-    let joined = as_other_user(&actor, &[Path::new("--run"), &copy, Path::new("--id"), Path::new("7")]);
-    let told = String::from_utf8_lossy(&joined.stderr);
+    let joined = as_other_user(
+        &actor,
+        &[Path::new("--run"), &copy, Path::new("--id"), Path::new("7")],
+    );
+    let message = String::from_utf8_lossy(&joined.stderr);
     assert!(
-        !joined.status.success() && told.contains("belongs to user 0"),
+        !joined.status.success() && message.contains("belongs to user 0"),
         "{joined:?}"
     );
 
@@ -127,7 +154,7 @@ fn nothing_listens_on_the_network() {
     );
     for process in processes {
         for descriptor in fs::read_dir(format!("/proc/{}/fd", process.pid())).unwrap() {
-            // One that was closed meanwhile leads nowhere.
+            // A descriptor that was closed meanwhile has no target.
             let Ok(target) = fs::read_link(descriptor.unwrap().path()) else {
                 continue;
             };
@@ -150,7 +177,7 @@ fn nothing_listens_on_the_network() {
     };
     assert!(
         !kind_of("unix").is_empty(),
-        "events go by sockets of the file system: {sockets:?}"
+        "events use sockets of the file system: {sockets:?}"
     );
     for kind in [
         "tcp", "tcp6", "udp", "udp6", "udplite", "udplite6", "raw", "raw6", "packet",

@@ -1,14 +1,14 @@
-//! How much memory an actor takes, however many snapshots go by.
+//! Memory of an actor, whatever the number of snapshots.
 
-use skein_tests::{Recipe, Role};
+use skein_tests::{Role, RunRecipe};
 
-/// Bytes that an actor may have in its memory, all that it shares with others included.
+/// Largest resident memory of an actor, in bytes, including shared memory.
 const MOST: u64 = 30_000_000;
-/// With policy lag 1 it holds a snapshot more: 32 to 36 MB were measured.
+/// With policy lag 1 an actor holds one more snapshot: 32 to 36 MB were measured.
 const MOST_WITH_LAG: u64 = 38_000_000;
 
 #[test]
-fn an_actor_stays_small_however_many_snapshots_it_is_sent() {
+fn an_actor_stays_small_whatever_the_number_of_snapshots() {
     assert_actors_stay_below(MOST, 0);
 }
 
@@ -18,19 +18,25 @@ fn an_actor_takes_one_snapshot_more_with_policy_lag() {
 }
 
 fn assert_actors_stay_below(bytes: u64, policy_lag: u64) {
-    // Networks as wide as in local.toml, and three times as many snapshots as there are places for.
-    let mut run = Recipe::small()
+    // Networks as wide as in local.toml, and three times as many snapshots as there are slots.
+    let mut run = RunRecipe::small()
         .set("sac.hidden_width=256")
-        .set("learning.flights_per_epoch=2")
+        .set("learning.episodes_per_epoch=2")
         .set(&format!("learning.policy_lag={policy_lag}"))
-        .set("run.flights=60")
+        .set("run.episodes=60")
         .start();
-    run.until_flights(48);
+    run.until_episodes(48);
     let actors = run.processes(Role::Actor);
     assert_eq!(actors.len(), 2);
     for actor in actors {
-        let most = actor.usage().expect("the actor is alive").most_resident_bytes;
-        println!("actor {}: {most} bytes with policy lag {policy_lag}", actor.pid());
+        let most = actor
+            .usage()
+            .expect("the actor is alive")
+            .most_resident_bytes;
+        println!(
+            "actor {}: {most} bytes with policy lag {policy_lag}",
+            actor.pid()
+        );
         assert!(most <= bytes, "actor {} took {most} bytes", actor.pid());
     }
     run.finish();

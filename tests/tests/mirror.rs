@@ -1,18 +1,21 @@
-//! What `learning.mirror` takes for granted: flown with mirrored commands through a mirrored course, a flight is the mirror image of the flight, image by image.
+//! The assumption of `learning.mirror`: mirrored commands in a mirrored course give the mirror
+//! image of the episode, image by image.
 
 use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_learner::flight::{CommittedFlight, StepObservation};
-use skein_protocol::ids::{ActorId, Epoch, FlightId, PolicyVersion};
-use skein_protocol::{ACTION, IMAGE_PIXELS, LONGEST_LATENT};
-use skein_simulator::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout};
-use skein_simulator::simulator::{Ahead, GroundTruth, Simulator, SimulatorSettings};
+use skein_learner::episode::{CommittedEpisode, StepObservation};
+use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
+use skein_protocol::{ACTION, IMAGE_PIXELS, MAX_LATENT, REWARD_TERMS};
+use skein_simulator::course::{
+    Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
+};
+use skein_simulator::simulator::{GroundTruth, OpeningAhead, Simulator, SimulatorSettings};
 
 const STEPS: usize = 15;
 
-/// Two openings without any symmetry, or their mirror images.
+/// Returns a course with two asymmetric openings, or its mirror image.
 fn course(side: f32) -> Course {
     let wall = |label, x_m, centre_m: [f32; 2], points: [[f32; 2]; 5]| {
         let mut points_m: Vec<_> = points.map(|[y_m, z_m]| [side * y_m, z_m]).into();
@@ -34,7 +37,13 @@ fn course(side: f32) -> Course {
         jitter_z_m: 0.0,
         ..StartArea::default()
     };
-    let shape = [[-1.0, -1.2], [1.4, -1.0], [1.1, 0.9], [0.2, 1.5], [-1.3, 0.8]];
+    let shape = [
+        [-1.0, -1.2],
+        [1.4, -1.0],
+        [1.1, 0.9],
+        [0.2, 1.5],
+        [-1.3, 0.8],
+    ];
     Course::new(CourseLayout {
         name: "mirror".to_owned(),
         corridor: Corridor::default(),
@@ -48,9 +57,9 @@ fn course(side: f32) -> Course {
     .expect("the course can be flown")
 }
 
-fn fly(side: f32) -> CommittedFlight {
-    let mut simulator =
-        Simulator::new(Arc::new(course(side)), &SimulatorSettings::default()).expect("the default settings are sound");
+fn fly(side: f32) -> CommittedEpisode {
+    let mut simulator = Simulator::new(Arc::new(course(side)), &SimulatorSettings::default())
+        .expect("the default settings are sound");
     let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
     simulator
         .reset(1, &mut start, &mut calm)
@@ -62,7 +71,7 @@ fn fly(side: f32) -> CommittedFlight {
         depth.extend_from_slice(&image);
         let state = simulator.state();
         observations.push(StepObservation {
-            latent: [0.0; LONGEST_LATENT],
+            latent: [0.0; MAX_LATENT],
             velocity_mps: state.velocity_mps.into(),
             position_m: state.position_m.coords.into(),
             orientation: state.world_from_body.coords.into(),
@@ -75,8 +84,8 @@ fn fly(side: f32) -> CommittedFlight {
             actions.push(action);
         }
     }
-    CommittedFlight {
-        flight: FlightId(0),
+    CommittedEpisode {
+        episode: EpisodeId(0),
         epoch: Epoch(0),
         policy_version: PolicyVersion(0),
         actor: ActorId(0),
@@ -85,7 +94,7 @@ fn fly(side: f32) -> CommittedFlight {
         action_before: [0.0; ACTION],
         observations,
         rewards: vec![0.0; STEPS],
-        reward_terms: vec![[0.0; 4]; STEPS],
+        reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: vec![false; STEPS],
         outcome: None,
         walls_passed: 0,
@@ -97,33 +106,47 @@ fn fly(side: f32) -> CommittedFlight {
 }
 
 #[test]
-fn the_mirror_image_of_a_flight_is_the_flight_through_the_mirrored_course() {
+fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
     let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
     assert_eq!(mirrored.actions, flown.actions);
-    for (step, (one, other)) in mirrored.observations.iter().zip(&flown.observations).enumerate() {
+    for (step, (one, other)) in mirrored
+        .observations
+        .iter()
+        .zip(&flown.observations)
+        .enumerate()
+    {
         for (what, one, other) in [
             ("position", &one.position_m[..], &other.position_m[..]),
             ("velocity", &one.velocity_mps, &other.velocity_mps),
             ("orientation", &one.orientation, &other.orientation),
             ("ground truth", &one.ground_truth, &other.ground_truth),
         ] {
-            let apart = one.iter().zip(other).map(|(one, other)| (one - other).abs());
+            let apart = one
+                .iter()
+                .zip(other)
+                .map(|(one, other)| (one - other).abs());
             let most = apart.fold(0.0, f32::max);
             assert!(most < 2e-3, "step {step}: {what} {one:?} and {other:?}");
         }
     }
-    let images = mirrored.depth.unwrap().into_iter().zip(flown.depth.unwrap());
-    let off = images.filter(|(one, other)| one.abs_diff(*other) > 1).count();
-    // Silhouettes may come to lie on the other side of a pixel's centre.
+    let images = mirrored
+        .depth
+        .unwrap()
+        .into_iter()
+        .zip(flown.depth.unwrap());
+    let off = images
+        .filter(|(one, other)| one.abs_diff(*other) > 1)
+        .count();
+    // Silhouettes may fall on the other side of a pixel's centre.
     let pixels = (STEPS + 1) * IMAGE_PIXELS;
     assert!(off < pixels / 200, "{off} of {pixels} pixels differ");
 }
 
 #[test]
-fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_else_is_turned() {
-    // `side` is 1 for the flight, -1 for its mirror image.
+fn mirroring_swaps_left_and_right_and_nothing_else() {
+    // `side` is 1 for the episode, -1 for its mirror image.
     let truth = |side: f32| {
-        let ahead = |distance_m: f32| Ahead {
+        let ahead = |distance_m: f32| OpeningAhead {
             distance_m,
             offset_m: [side * 1.5, 2.5],
             clearance_m: 0.9,
@@ -139,5 +162,8 @@ fn all_that_points_to_the_left_points_to_the_right_in_the_mirror_and_nothing_els
     };
     let mut flown = fly(1.0);
     flown.observations[0].ground_truth = truth(1.0).numbers();
-    assert_eq!(flown.mirrored().observations[0].ground_truth, truth(-1.0).numbers());
+    assert_eq!(
+        flown.mirrored().observations[0].ground_truth,
+        truth(-1.0).numbers()
+    );
 }

@@ -1,6 +1,10 @@
-//! The actor's networks are the learner's: the same parameters give the same numbers, to 1e-5 by libtorch and to the last bit by the native engine's encoder.
+//! The actor's networks equal the learner's: the same parameters give the same numbers, to 1e-5
+//! with libtorch and to the last bit with the native engine's encoder.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -36,7 +40,8 @@ fn with_latent(latent: usize) -> Config {
     config
 }
 
-/// What the learner would publish, with the policy's parameters written by `policy`.
+/// Returns the network that the learner would publish, with the policy's parameters written by
+/// `policy`.
 fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
     let layout = SnapshotLayout::of(config);
     let mut values = vec![0.0; layout.values()];
@@ -48,7 +53,6 @@ fn network(config: &Config, vae: &Vae, policy: impl Fn(&mut [f32])) -> Network {
             values,
         },
         &layout,
-        config.vae.encoder_precision,
     )
 }
 
@@ -73,7 +77,7 @@ fn assert_close(what: &str, native: &[f32], learner: &[f32]) {
 fn assert_alive(what: &str, values: &[f32]) {
     assert!(
         values.iter().any(|value| value.abs() > 1e-3),
-        "{what} is all noughts: nothing was compared"
+        "{what} is all zeros, so the comparison shows nothing"
     );
 }
 
@@ -85,7 +89,7 @@ fn gaussian(network: &Network, observed: &[f32]) -> [[f32; ACTION]; 2] {
 }
 
 #[test]
-fn the_native_encoder_is_the_learners() {
+fn the_native_encoder_equals_the_learners() {
     for (seed, latent) in SEEDS.zip([32, 8, 64]) {
         let config = with_latent(latent);
         let vae = vae(&config, seed);
@@ -104,18 +108,25 @@ fn the_native_encoder_is_the_learners() {
 }
 
 #[test]
-fn the_native_policy_is_the_learners() {
+fn the_native_policy_equals_the_learners() {
     for (seed, observation) in SEEDS.zip(OBSERVATIONS) {
         let config = config(observation);
         let mut layout = Layout::default();
-        let policy = Policy::describe(&mut layout, config.view().len() as i64, config.sac.hidden_width as i64);
+        let policy = Policy::describe(
+            &mut layout,
+            config.observation_layout().len() as i64,
+            config.sac.hidden_width as i64,
+        );
         let parameters = Parameters::initialise(layout, seed, Device::Cpu);
         let network = network(&config, &vae(&config, seed), |into| {
             parameters.copy_range(0..into.len(), into)
         });
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
-        let observed: Vec<f32> = (0..config.view().len()).map(|_| rng.random_range(-3.0..3.0)).collect();
-        let (mean, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
+        let observed: Vec<f32> = (0..config.observation_layout().len())
+            .map(|_| rng.random_range(-3.0..3.0))
+            .collect();
+        let (mean, log_std) =
+            policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
         let [native_mean, native_log_std] = gaussian(&network, &observed);
         assert_alive("mean", &native_mean);
         assert_alive("log_std", &native_log_std);
@@ -125,10 +136,14 @@ fn the_native_policy_is_the_learners() {
 }
 
 #[test]
-fn both_bound_an_extreme_spread_alike() {
+fn both_bound_an_extreme_standard_deviation_alike() {
     let config = config(Observation::Latent);
     let mut layout = Layout::default();
-    let policy = Policy::describe(&mut layout, config.view().len() as i64, config.sac.hidden_width as i64);
+    let policy = Policy::describe(
+        &mut layout,
+        config.observation_layout().len() as i64,
+        config.sac.hidden_width as i64,
+    );
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
     // The last two values are the biases of the logarithms of the standard deviations.
     let count = parameters.layout().len();
@@ -143,20 +158,26 @@ fn both_bound_an_extreme_spread_alike() {
     let network = network(&config, &vae(&config, 0), |into| {
         parameters.copy_range(0..into.len(), into)
     });
-    let observed = vec![0.5; config.view().len()];
-    let (_, log_std) = policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
+    let observed = vec![0.5; config.observation_layout().len()];
+    let (_, log_std) =
+        policy.distribution(&parameters, &Tensor::from_slice(&observed).unsqueeze(0));
     let [_, native_log_std] = gaussian(&network, &observed);
     assert_eq!(native_log_std.to_vec(), rows(&log_std)[0]);
 }
 
 #[test]
-fn what_the_learner_publishes_flies_as_the_learner_says() {
+fn a_published_policy_acts_as_in_the_learner() {
     for observation in OBSERVATIONS {
         let config = config(observation);
-        let (inputs, observed) = (Inputs::of(&config), vec![0.3; config.view().len()]);
+        let (inputs, observed) = (
+            Inputs::of(&config),
+            vec![0.3; config.observation_layout().len()],
+        );
         let flies_as = |sac: &dyn Algorithm, learner: &[f32]| {
             let network = network(&config, &vae(&config, 9), |into| sac.publish(into));
-            let actor = network.distribution(&observed, &mut Scratch::default()).mode();
+            let actor = network
+                .distribution(&observed, &mut Scratch::default())
+                .mode();
             assert_alive("action", &actor);
             assert_close("action", &actor, learner);
         };
@@ -174,9 +195,11 @@ fn the_native_engine_encodes_as_the_actor_does_bit_for_bit() {
         let mut native = NativeVae::new(&config.vae, 3, 2);
         let torch = vae(&config, 3);
         let mut rng = Pcg64Mcg::seed_from_u64(3);
-        let images: Vec<[u8; IMAGE_PIXELS]> = (0..3).map(|_| std::array::from_fn(|_| rng.random())).collect();
+        let images: Vec<[u8; IMAGE_PIXELS]> = (0..3)
+            .map(|_| std::array::from_fn(|_| rng.random()))
+            .collect();
         let learner = native.encode(&images.concat());
-        // Both engines begin with the same parameters.
+        // Both engines start with the same parameters.
         let network = network(&config, &torch, |_| {});
         let mut scratch = Scratch::default();
         for (image, learner) in images.iter().zip(learner.chunks_exact(latent)) {

@@ -1,21 +1,24 @@
-//! What cannot be done is refused with one line that says what to change, and nothing is left of the attempt.
+//! Invalid requests are refused with one line that names the remedy, and leave nothing behind.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 
-use skein_tests::{Output, Recipe, program, repository, run_program};
+use skein_tests::{ProgramOutput, RunRecipe, program, repository, run_program};
 use tempfile::TempDir;
 
-/// `skein run` with a configuration of its own, which must not come to life.
+/// A `skein run` with a configuration of its own, which must be refused.
 struct Attempt {
     folder: TempDir,
 }
 
 impl Attempt {
-    /// With `tests/small.toml`, and `more` behind it.
+    /// Prepares `tests/small.toml` with `more` appended.
     fn new(more: &str) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let courses = repository().join("configs/courses");
@@ -30,7 +33,7 @@ impl Attempt {
         self.folder.path()
     }
 
-    fn run(&self, arguments: &[&str]) -> Output {
+    fn run(&self, arguments: &[&str]) -> ProgramOutput {
         let (config, run) = (self.path().join("mine.toml"), self.path().join("run"));
         let basic = [
             "run",
@@ -48,13 +51,13 @@ impl Attempt {
         self.run(arguments).assert_refused(parts);
         assert!(
             !self.path().join("run").exists(),
-            "a directory was made for a run that cannot be"
+            "a directory was created for an impossible run"
         );
     }
 }
 
 #[test]
-fn a_directory_that_is_not_empty() {
+fn a_directory_that_is_not_empty_is_refused() {
     let attempt = Attempt::new("");
     let run = attempt.path().join("run");
     fs::create_dir(&run).unwrap();
@@ -62,18 +65,24 @@ fn a_directory_that_is_not_empty() {
     attempt
         .run(&[])
         .assert_refused(&[run.to_str().unwrap(), "not empty", "--run-dir"]);
-    assert_eq!(fs::read_dir(&run).unwrap().count(), 1, "something was put beside it");
+    assert_eq!(
+        fs::read_dir(&run).unwrap().count(),
+        1,
+        "something was written into the directory"
+    );
 }
 
 #[test]
-fn an_unknown_key_section_or_setting() {
-    Attempt::new("[replay]\ncapcity = 1000\n").assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
+fn an_unknown_key_section_or_setting_is_refused() {
+    Attempt::new("[replay]\ncapcity = 1000\n")
+        .assert_refused(&[], &["mine.toml", "[replay]", "capcity"]);
     Attempt::new("[replays]\n").assert_refused(&[], &["mine.toml", "[replays]"]);
-    Attempt::new("[simulator.camera]\nzoom = 2\n").assert_refused(&[], &["mine.toml", "[simulator]", "zoom"]);
+    Attempt::new("[simulator.camera]\nzoom = 2\n")
+        .assert_refused(&[], &["mine.toml", "[simulator]", "zoom"]);
     let sound = Attempt::new("");
     sound.assert_refused(&["--set", "run.sede=1"], &["[run]", "sede"]);
     sound.assert_refused(&["--set", "seed=1"], &["--set seed=1", "section.key=value"]);
-    sound.assert_refused(&["--set", "run.flights=many"], &["[run]", "flights"]);
+    sound.assert_refused(&["--set", "run.episodes=many"], &["[run]", "episodes"]);
     sound.assert_refused(
         &["--set", "learning.policy_lag=2"],
         &["learning.policy_lag = 2", "above 1"],
@@ -81,17 +90,17 @@ fn an_unknown_key_section_or_setting() {
 }
 
 #[test]
-fn a_configuration_or_course_that_is_not_there() {
+fn a_missing_configuration_or_course_is_refused() {
     let attempt = Attempt::new("");
-    attempt.assert_refused(&["--config", "/nowhere/mine.toml"], &["/nowhere/mine.toml"]);
-    attempt.assert_refused(
-        &["--set", "courses.training=/nowhere/course.toml"],
-        &["/nowhere/course.toml"],
-    );
+    let missing = attempt.path().join("missing");
+    let (config, course) = (missing.join("mine.toml"), missing.join("course.toml"));
+    let (config, course) = (config.to_str().unwrap(), course.to_str().unwrap());
+    attempt.assert_refused(&["--config", config], &[config]);
+    attempt.assert_refused(&["--set", &format!("courses.training={course}")], &[course]);
 }
 
 #[test]
-fn a_course_that_cannot_be_flown() {
+fn a_course_that_cannot_be_flown_is_refused() {
     let attempt = Attempt::new("");
     let shipped = fs::read_to_string(repository().join("configs/courses/training.toml")).unwrap();
     let bent = attempt.path().join("bent.toml");
@@ -102,46 +111,62 @@ fn a_course_that_cannot_be_flown() {
         fs::write(&bent, text).unwrap();
         attempt.assert_refused(&["--set", &set], &[&["bent.toml"], parts].concat());
     };
-    refused("width_m = 2.2", "width_m = 0.1", &["wall 1", "width_m = 0.1", "drone"]);
-    refused("centre_m = ", "centre_m = [2.9, 3.5] # ", &["wall 1", "centre_m"]);
+    refused(
+        "width_m = 2.2",
+        "width_m = 0.1",
+        &["wall 1", "width_m = 0.1", "drone"],
+    );
+    refused(
+        "centre_m = ",
+        "centre_m = [2.9, 3.5] # ",
+        &["wall 1", "centre_m"],
+    );
 
-    // An unknown key is shown where it stands, on lines of its own.
+    // An unknown key is shown in its context, on several lines.
     fs::write(&bent, shipped.replacen("width_m = 2.2", "girth_m = 2.2", 1)).unwrap();
     let output = attempt.run(&["--set", &set]);
     output.assert_refused(&["bent.toml", "wall 1"]);
-    assert!(output.stderr.contains("unknown field `girth_m`"), "{}", output.stderr);
+    assert!(
+        output.stderr.contains("unknown field `girth_m`"),
+        "{}",
+        output.stderr
+    );
 }
 
 #[test]
-fn a_device_that_this_machine_does_not_have() {
-    let run = Recipe::small().set("run.device=cuda:7").start().wait();
+fn a_device_that_this_machine_does_not_have_is_refused() {
+    let run = RunRecipe::small().set("run.device=cuda:7").start().wait();
     assert_eq!(run.output.code, Some(1));
     run.output.assert_refused(&["cuda:7", "cpu"]);
     assert!(
         !run.directory.root().exists(),
-        "the directory of a run that never began is left"
+        "the directory of a run that never began remains"
     );
     run.assert_nothing_is_left();
 }
 
 #[test]
-fn an_actor_for_a_run_that_is_not_there_or_over() {
-    run_program("skein", &["attach", "--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
+fn an_actor_for_a_missing_or_complete_run_is_refused() {
     let empty = tempfile::tempdir().unwrap();
+    let missing = empty.path().join("missing");
+    let missing = missing.to_str().unwrap();
+    run_program("skein", &["attach", "--run", missing]).assert_refused(&[missing]);
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory]);
-    let over = Recipe::small().set("run.flights=1").finish();
+    let over = RunRecipe::small().set("run.episodes=1").finish();
     let directory = over.directory.root().to_str().unwrap();
-    run_program("skein", &["attach", "--run", directory]).assert_refused(&[directory, "not under way"]);
+    run_program("skein", &["attach", "--run", directory])
+        .assert_refused(&[directory, "not under way"]);
 }
 
 #[test]
-fn shared_memory_that_is_too_small() {
-    // A mount of our own, which nobody else sees: not every machine lets us.
+fn too_little_shared_memory_is_refused() {
+    // A private mount, which not every machine allows.
     let attempt = Attempt::new("");
     let (config, run) = (attempt.path().join("mine.toml"), attempt.path().join("run"));
     let script = format!(
-        "mount -t tmpfs -o size=8m tmpfs /dev/shm || exit 77; exec {} run --config {} --run-dir {} --actors 2",
+        "mount -t tmpfs -o size=8m tmpfs /dev/shm || exit 77; exec {} run --config {} --run-dir \
+         {} --actors 2",
         program("skein").display(),
         config.display(),
         run.display()
@@ -150,12 +175,12 @@ fn shared_memory_that_is_too_small() {
         .args(["--mount", "--map-root-user", "sh", "-c", &script])
         .output();
     let Ok(output) = output else {
-        eprintln!("skipped: there is no unshare");
+        eprintln!("skipped: unshare is not installed");
         return;
     };
     let stderr = String::from_utf8_lossy(&output.stderr);
     if output.status.code() == Some(77) || stderr.contains("unshare") {
-        eprintln!("skipped: nothing can be mounted here: {stderr}");
+        eprintln!("skipped: this user may not mount: {stderr}");
         return;
     }
     assert_eq!(output.status.code(), Some(1), "{stderr}");
@@ -172,32 +197,46 @@ fn shared_memory_that_is_too_small() {
 }
 
 #[test]
-fn a_resumption_of_what_cannot_be_gone_on_with() {
+fn an_impossible_resumption_is_refused() {
     let empty = tempfile::tempdir().unwrap();
     let directory = empty.path().to_str().unwrap();
     run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "run.json"]);
-    let with_config = run_program("skein", &["run", "--resume", directory, "--set", "run.seed=2"]);
+    let with_config = run_program(
+        "skein",
+        &["run", "--resume", directory, "--set", "run.seed=2"],
+    );
     assert_eq!(with_config.code, Some(2));
     assert!(
         with_config
             .stderr
-            .contains("with the configuration it was started with"),
+            .contains("the configuration stored in it"),
         "{}",
         with_config.stderr
     );
 
-    let mut running = Recipe::small().start();
-    running.until_flights(1);
+    let mut running = RunRecipe::small().start();
+    running.until_episodes(1);
     let root = running.directory().root().to_owned();
     let directory = root.to_str().unwrap();
-    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "under way", "attach_actor.sh"]);
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[
+        directory,
+        "under way",
+        "attach_actor.sh",
+    ]);
     let _complete = running.finish();
-    run_program("skein", &["run", "--resume", directory]).assert_refused(&[directory, "complete", "40 flights"]);
+    run_program("skein", &["run", "--resume", directory]).assert_refused(&[
+        directory,
+        "complete",
+        "40 episodes",
+    ]);
 }
 
 #[test]
-fn an_evaluation_of_nothing() {
-    run_program("skein-evaluate", &["--run", "/nowhere/run"]).assert_refused(&["/nowhere/run"]);
-    run_program("skein-evaluate", &["--snapshot", "/nowhere/best.safetensors"])
-        .assert_refused(&["/nowhere/best.safetensors"]);
+fn an_evaluation_without_a_run_or_snapshot_is_refused() {
+    let empty = tempfile::tempdir().unwrap();
+    let missing = empty.path().join("missing");
+    let missing = missing.to_str().unwrap();
+    for option in ["--run", "--snapshot"] {
+        run_program("skein-evaluate", &[option, missing]).assert_refused(&[missing]);
+    }
 }

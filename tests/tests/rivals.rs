@@ -1,16 +1,20 @@
-//! The paper's rivals as whole runs: a policy that learns from images, without a VAE, and a U-Net in the VAE's place.
+//! The paper's rivals as complete runs: a policy that learns from images, without a VAE, and a
+//! U-Net in place of the VAE.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::fs;
 
 use rustix::process::Signal;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::summary::Summary;
-use skein_tests::{Ended, Recipe};
+use skein_tests::{EndedRun, RunRecipe};
 
-fn end_to_end(algorithm: &str) -> Recipe {
-    Recipe::small()
+fn end_to_end(algorithm: &str) -> RunRecipe {
+    RunRecipe::small()
         .set("learning.encoder=end-to-end")
         .set(&format!("learning.algorithm={algorithm}"))
         .set("run.learner_threads=1")
@@ -20,12 +24,12 @@ fn end_to_end(algorithm: &str) -> Recipe {
         .set("td3.hidden_width=32")
 }
 
-fn learners_log(run: &Ended) -> String {
+fn learners_log(run: &EndedRun) -> String {
     fs::read_to_string(run.directory.logs().join("learner.log")).unwrap()
 }
 
 #[test]
-fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bit_for_bit() {
+fn without_a_vae_a_run_killed_and_resumed_with_more_actors_learns_the_same_bit_for_bit() {
     let calm = end_to_end("sac").actors(1).finish();
     assert!(
         learners_log(&calm).contains("engine=libtorch"),
@@ -33,7 +37,9 @@ fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bi
         learners_log(&calm)
     );
     let Summary {
-        updates, vae_updates, ..
+        updates,
+        vae_updates,
+        ..
     } = calm.summary();
     assert!(
         updates > 10 && vae_updates == 0,
@@ -41,32 +47,40 @@ fn without_a_vae_a_run_killed_and_gone_on_with_by_more_actors_learns_the_same_bi
     );
 
     let mut run = end_to_end("sac").actors(2).start();
-    // After the first checkpoint, amid updates.
-    run.until_flights(25);
+    // After the first checkpoint, during updates.
+    run.until_episodes(25);
     run.process("skein-learner").signal(Signal::KILL);
     run.finish().assert_same_as(&calm);
 }
 
 #[test]
-fn snapshots_of_such_a_run_are_laid_out_as_ever_and_the_critic_has_trained_their_encoder() {
-    let encoder = |run: &Ended| {
+fn without_a_vae_the_critic_trains_the_encoder_of_ordinary_snapshots() {
+    let encoder = |run: &EndedRun| {
         let (snapshot, config) = Snapshot::load(&run.directory.latest_snapshot()).unwrap();
         snapshot.values[SnapshotLayout::of(&config).encoder()].to_vec()
     };
     let trained = end_to_end("td3").finish();
-    let untrained = end_to_end("td3").set("learning.updates_per_step=0").finish();
+    let untrained = end_to_end("td3")
+        .set("learning.updates_per_step=0")
+        .finish();
     let (trained_encoder, untrained_encoder) = (encoder(&trained), encoder(&untrained));
     assert_eq!(trained_encoder.len(), untrained_encoder.len());
     assert_ne!(trained_encoder, untrained_encoder);
-    // Nothing is there to be reconstructed, and nothing is told of it.
+    // Without a VAE nothing is reconstructed or plotted.
     assert!(!trained.directory.reconstructions().exists());
-    assert!(!trained.directory.plots().join("reconstructions.png").exists());
-    assert!(trained.directory.plots().join("flight_paths.png").exists());
+    assert!(
+        !trained
+            .directory
+            .plots()
+            .join("reconstructions.png")
+            .exists()
+    );
+    assert!(trained.directory.plots().join("trajectories.png").exists());
 }
 
 #[test]
 fn a_u_net_trains_on_libtorch_while_the_policy_stays_on_the_kernels() {
-    let u_net = Recipe::small().set("vae.decoder=u-net").finish();
+    let u_net = RunRecipe::small().set("vae.decoder=u-net").finish();
     let log = learners_log(&u_net);
     assert!(
         log.contains("engine=native") && log.contains("vae_engine=libtorch"),
@@ -74,6 +88,6 @@ fn a_u_net_trains_on_libtorch_while_the_policy_stays_on_the_kernels() {
     );
     assert!(u_net.summary().vae_updates > 5);
     assert!(u_net.directory.plots().join("reconstructions.png").exists());
-    let plain = Recipe::small().finish();
+    let plain = RunRecipe::small().finish();
     assert_ne!(u_net.summary().policy_sha256, plain.summary().policy_sha256);
 }

@@ -1,6 +1,9 @@
-//! The configurations that are shipped can be run, and the faithful one is the paper's.
+//! The shipped configurations can run, and `paper.toml` has the paper's values.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -27,22 +30,30 @@ fn load(name: &str) -> Config {
 }
 
 #[test]
-fn the_configurations_are_there() {
+fn the_shipped_configurations_exist() {
     let names: Vec<_> = shipped()
         .iter()
         .map(|path| path.file_name().unwrap().to_str().unwrap().to_owned())
         .collect();
-    assert_eq!(names, ["generalist.toml", "local.toml", "paper.toml", "smoke.toml"]);
+    assert_eq!(
+        names,
+        ["generalist.toml", "local.toml", "paper.toml", "smoke.toml"]
+    );
 }
 
 #[test]
-fn every_shipped_configuration_can_be_flown_as_it_stands() {
+fn every_shipped_configuration_can_be_flown_unchanged() {
     for file in shipped() {
         let config = Config::load(&file, &[]).unwrap();
         let settings: SimulatorSettings = toml::Value::Table(config.simulator)
             .try_into()
             .unwrap_or_else(|error| panic!("{}: {error}", file.display()));
-        for path in config.courses.evaluation.iter().chain([&config.courses.training]) {
+        for path in config
+            .courses
+            .evaluation
+            .iter()
+            .chain([&config.courses.training])
+        {
             let course = Arc::new(Course::load(path).unwrap());
             assert!(
                 course.walls().len() >= usize::from(config.learning.levels),
@@ -53,25 +64,25 @@ fn every_shipped_configuration_can_be_flown_as_it_stands() {
             Simulator::new(course, &settings).unwrap();
         }
         Course::generate(0, &settings.generator).unwrap();
-        assert!((settings.max_steps as usize) < config.transport.max_records_per_flight);
+        assert!((settings.max_steps as usize) < config.transport.max_records_per_episode);
     }
 }
 
 #[test]
-fn the_faithful_configuration_is_the_papers() {
+fn the_paper_configuration_has_the_papers_values() {
     let paper = load("paper.toml");
-    assert_eq!(paper.run.flights, 4000);
-    assert_eq!(paper.learning.flights_per_epoch, 1);
+    assert_eq!(paper.run.episodes, 4000);
+    assert_eq!(paper.learning.episodes_per_epoch, 1);
     assert_eq!(paper.learning.policy_lag, 0);
     assert_eq!(paper.learning.warmup_steps, 2000);
-    assert_eq!(paper.learning.flights_per_level, 10);
+    assert_eq!(paper.learning.episodes_per_level, 10);
     assert_eq!(paper.learning.levels, 5);
     assert_eq!(paper.learning.observation, Observation::Latent);
     assert_eq!(paper.vae.train_steps, 10_000);
     assert_eq!(paper.replay.capacity, 131_072);
     assert_eq!(paper.replay.success_share, 0.125);
-    assert_eq!(paper.evaluation.window_flights, 50);
-    assert_eq!(paper.evaluation.flights, 100);
+    assert_eq!(paper.evaluation.window_episodes, 50);
+    assert_eq!(paper.evaluation.episodes, 100);
     assert_eq!(paper.courses.generated_share, 0.0);
     assert_eq!(
         paper.courses.evaluation.len(),
@@ -83,14 +94,25 @@ fn the_faithful_configuration_is_the_papers() {
 }
 
 #[test]
-fn every_shipped_suite_can_be_flown_and_one_tells_every_family_of_shapes_apart() {
-    let suite = |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
-    let [generalist, shapes, untried] = ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
+fn every_shipped_suite_can_be_flown_and_one_has_an_entry_per_family_of_shapes() {
+    let suite =
+        |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
+    let [generalist, shapes, untried] =
+        ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
     let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
-        entry.courses.of_flight(0).unwrap();
+        entry.courses.of_episode(0).unwrap();
     }
-    let told: Vec<&str> = shapes.entries.iter().map(|entry| entry.name.as_str()).collect();
-    let families = GeneratedShape::HELD_OUT.into_iter().chain(GeneratedShape::TRAINED);
-    assert_eq!(told, families.map(GeneratedShape::name).collect::<Vec<_>>());
+    let named: Vec<&str> = shapes
+        .entries
+        .iter()
+        .map(|entry| entry.name.as_str())
+        .collect();
+    let families = GeneratedShape::HELD_OUT
+        .into_iter()
+        .chain(GeneratedShape::TRAINED);
+    assert_eq!(
+        named,
+        families.map(GeneratedShape::name).collect::<Vec<_>>()
+    );
 }

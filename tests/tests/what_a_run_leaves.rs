@@ -1,6 +1,9 @@
-//! What a run leaves in its directory, file by file, as it was promised; and nothing anywhere else.
+//! Contents of a run's directory, file by file, as documented; and nothing anywhere else.
 
-#![allow(clippy::unwrap_used, reason = "a test's helpers fail by panicking, as tests do")]
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,16 +12,16 @@ use std::process::Command;
 
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::stages::{Stage, Thread};
-use skein_protocol::summary::Ending;
-use skein_tests::{Ended, Recipe};
+use skein_protocol::stages::{Stage, ThreadRole};
+use skein_protocol::summary::RunEnding;
+use skein_tests::{EndedRun, RunRecipe};
 
 #[test]
-fn a_completed_run_leaves_what_it_promises() {
-    let run = Recipe::small().set("run.seed=7").finish();
+fn a_completed_run_leaves_all_documented_files() {
+    let run = RunRecipe::small().set("run.seed=7").finish();
     the_configuration_is_resolved(&run);
-    the_flights_have_the_promised_columns(&run);
-    the_summary_agrees_with_the_flights(&run);
+    the_episodes_have_the_documented_columns(&run);
+    the_summary_agrees_with_the_episodes(&run);
     the_stages_agree_with_the_counts(&run);
     the_snapshots_are_those_of_the_summary(&run);
     the_evaluation_is_of_the_best_snapshot(&run);
@@ -29,15 +32,19 @@ fn a_completed_run_leaves_what_it_promises() {
     the_conclusion_shows_the_tables_and_the_paths(&run);
 }
 
-fn the_configuration_is_resolved(run: &Ended) {
+fn the_configuration_is_resolved(run: &EndedRun) {
     let text = fs::read_to_string(run.directory.config()).unwrap();
     let config: toml::Table = toml::from_str(&text).unwrap();
     assert_eq!(config["run"]["seed"].as_integer(), Some(7));
-    assert_eq!(config["sac"]["hidden_width"].as_integer(), Some(32), "set in the file");
+    assert_eq!(
+        config["sac"]["hidden_width"].as_integer(),
+        Some(32),
+        "set in the file"
+    );
     for [section, key] in [["sac", "discount"], ["vae", "kl_weight"]] {
         assert!(
             config[section][key].is_float(),
-            "{section}.{key} is a default that nobody set"
+            "the default of {section}.{key} is missing"
         );
     }
     let vehicle = &config["simulator"]["vehicle"];
@@ -50,9 +57,14 @@ fn the_configuration_is_resolved(run: &Ended) {
         text.contains(env!("CARGO_PKG_VERSION")),
         "the version is missing:\n{text}"
     );
-    // What it names is in the directory too.
+    // The courses that it names are in the directory too.
     let config = Config::load(&run.directory.config(), &[]).unwrap();
-    for course in config.courses.evaluation.iter().chain([&config.courses.training]) {
+    for course in config
+        .courses
+        .evaluation
+        .iter()
+        .chain([&config.courses.training])
+    {
         assert!(
             course.starts_with(run.directory.courses()) && course.is_file(),
             "{course:?}"
@@ -60,28 +72,31 @@ fn the_configuration_is_resolved(run: &Ended) {
     }
 }
 
-fn the_flights_have_the_promised_columns(run: &Ended) {
-    let text = fs::read_to_string(run.directory.flights_csv()).unwrap();
+fn the_episodes_have_the_documented_columns(run: &EndedRun) {
+    let text = fs::read_to_string(run.directory.episodes_csv()).unwrap();
     assert_eq!(
         text.lines().next(),
-        Some("flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome")
+        Some("episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome")
     );
-    let flights = run.flights();
-    assert_eq!(flights.len(), 40);
-    for (number, flight) in (0u64..).zip(&flights) {
-        // Ten flights from each level in turn.
-        assert_eq!(u64::from(flight.level), number / 10 % 5 + 1, "{flight:?}");
-        assert!((1..=160).contains(&flight.steps), "{flight:?}");
-        assert!(flight.walls_passed <= 5, "{flight:?}");
-        assert!(flight.r#return.parse::<f32>().unwrap().is_finite(), "{flight:?}");
+    let episodes = run.episodes();
+    assert_eq!(episodes.len(), 40);
+    for (number, episode) in (0u64..).zip(&episodes) {
+        // Ten episodes start from each level in turn.
+        assert_eq!(u64::from(episode.level), number / 10 % 5 + 1, "{episode:?}");
+        assert!((1..=160).contains(&episode.steps), "{episode:?}");
+        assert!(episode.walls_passed <= 5, "{episode:?}");
         assert!(
-            ["collided", "reached_end", "timed_out"].contains(&flight.outcome.as_str()),
-            "{flight:?}"
+            episode.r#return.parse::<f32>().unwrap().is_finite(),
+            "{episode:?}"
+        );
+        assert!(
+            ["collided", "reached_end", "timed_out"].contains(&episode.outcome.as_str()),
+            "{episode:?}"
         );
     }
 }
 
-/// That changed what the learner is made of; empty outside a clone.
+/// Returns the last commit that changed the learner's sources; empty outside a clone.
 fn last_commit() -> String {
     if !Path::new("../.git").exists() {
         return String::new();
@@ -95,9 +110,9 @@ fn last_commit() -> String {
     String::from_utf8(output.stdout).unwrap().trim().to_owned()
 }
 
-fn the_summary_agrees_with_the_flights(run: &Ended) {
-    let (summary, flights) = (run.summary(), run.flights());
-    // In a clone with the commit behind it.
+fn the_summary_agrees_with_the_episodes(run: &EndedRun) {
+    let (summary, episodes) = (run.summary(), run.episodes());
+    // In a clone, the commit follows the version.
     let (version, commit) = summary
         .skein_version
         .split_once('+')
@@ -109,47 +124,63 @@ fn the_summary_agrees_with_the_flights(run: &Ended) {
         "{commit}"
     );
     assert_eq!(summary.seed, 7);
-    assert_eq!(summary.ending, Ending::Completed);
+    assert_eq!(summary.ending, RunEnding::Completed);
     assert_eq!(summary.final_version.0, 4);
-    assert_eq!(summary.flights, flights.len() as u64);
-    assert_eq!(summary.steps, flights.iter().map(|flight| flight.steps).sum::<u64>());
-    assert!(summary.updates > 0 && summary.vae_updates > 0, "{summary:?}");
+    assert_eq!(summary.episodes, episodes.len() as u64);
+    assert_eq!(
+        summary.steps,
+        episodes.iter().map(|episode| episode.steps).sum::<u64>()
+    );
+    assert!(
+        summary.updates > 0 && summary.vae_updates > 0,
+        "{summary:?}"
+    );
     // Three on each of two courses, and at least one that confirmed the best snapshot.
-    assert!(summary.evaluation_flights > 6, "{summary:?}");
+    assert!(summary.evaluation_episodes > 6, "{summary:?}");
 }
 
-/// Each thread's stages are its whole time, and each was gone through as often as there was something to do.
-fn the_stages_agree_with_the_counts(run: &Ended) {
+/// Asserts that each thread's stages add up to its time, and that each stage was counted as often
+/// as there was work for it.
+fn the_stages_agree_with_the_counts(run: &EndedRun) {
     let summary = run.summary();
     let count = |stage| summary.stages.of(stage).count;
     let secs = |thread| summary.stages.total_nanos(thread) as f64 / 1e9;
-    let evaluated = fs::read_to_string(run.directory.evaluation_paths_csv()).unwrap();
-    // A header, and a row for each observation of six flights.
+    let evaluated = fs::read_to_string(run.directory.evaluation_trajectories_csv()).unwrap();
+    // A header, and a row per observation of six episodes.
     let evaluation_steps = evaluated.lines().count() as u64 - 1 - 6;
-    let (flights, steps) = (count(Stage::TakeOff), count(Stage::Physics));
-    let flown = summary.flights + summary.evaluation_flights;
-    // The last flight's end may not have been heard of yet.
+    let (episodes, steps) = (count(Stage::Reset), count(Stage::Physics));
+    let flown = summary.episodes + summary.evaluation_episodes;
+    // The last episode's end may not have arrived yet.
     assert!(
-        (flown - 1..=flown).contains(&flights),
-        "{flights} flights of {summary:?}"
+        (flown - 1..=flown).contains(&episodes),
+        "{episodes} episodes of {summary:?}"
     );
-    // Those that confirmed the best snapshot were flown besides.
-    assert!(steps > summary.steps + evaluation_steps, "{steps} steps of {summary:?}");
+    // Confirmation episodes come in addition.
+    assert!(
+        steps > summary.steps + evaluation_steps,
+        "{steps} steps of {summary:?}"
+    );
     assert_eq!(count(Stage::Policy), steps);
-    assert_eq!([Stage::Camera, Stage::Encoder].map(count), [steps + flights; 2]);
-    assert!((steps + flights - 1..=steps + flights).contains(&count(Stage::Send)));
-    assert!(count(Stage::Assemble) >= summary.steps + summary.flights);
-    assert_eq!(count(Stage::TakeIn), summary.flights);
-    assert_eq!(count(Stage::Evaluate), summary.evaluation_flights);
-    assert_eq!([Stage::Sample, Stage::PolicyUpdate].map(count), [summary.updates; 2]);
+    assert_eq!(
+        [Stage::Camera, Stage::Encoder].map(count),
+        [steps + episodes; 2]
+    );
+    assert!((steps + episodes - 1..=steps + episodes).contains(&count(Stage::Send)));
+    assert!(count(Stage::Assemble) >= summary.steps + summary.episodes);
+    assert_eq!(count(Stage::TakeIn), summary.episodes);
+    assert_eq!(count(Stage::Evaluate), summary.evaluation_episodes);
+    assert_eq!(
+        [Stage::Sample, Stage::PolicyUpdate].map(count),
+        [summary.updates; 2]
+    );
     assert_eq!(
         [Stage::SampleImages, Stage::VaeStep].map(count),
         [summary.vae_updates; 2]
     );
-    // One for the parameters it began with.
+    // One for the initial parameters.
     assert_eq!(count(Stage::Publish), summary.final_version.0 + 1);
     assert_eq!(count(Stage::Recode), 1);
-    let (training, receiving) = (secs(Thread::Training), secs(Thread::Receiving));
+    let (training, receiving) = (secs(ThreadRole::Training), secs(ThreadRole::Receiving));
     assert!(
         (summary.wall_secs - training).abs() < 0.1,
         "{training} s of {summary:?}"
@@ -158,14 +189,14 @@ fn the_stages_agree_with_the_counts(run: &Ended) {
         receiving > 0.5 * training && receiving <= summary.wall_secs,
         "{receiving} s of {summary:?}"
     );
-    let actors = secs(Thread::Actors);
+    let actors = secs(ThreadRole::Actors);
     assert!(
         actors > 0.5 * training && actors <= 2.0 * summary.wall_secs,
         "{actors} s of {summary:?}"
     );
 }
 
-fn the_snapshots_are_those_of_the_summary(run: &Ended) {
+fn the_snapshots_are_those_of_the_summary(run: &EndedRun) {
     let summary = run.summary();
     let (latest, _) = Snapshot::load(&run.directory.latest_snapshot()).unwrap();
     assert_eq!(latest.version, summary.final_version);
@@ -175,15 +206,19 @@ fn the_snapshots_are_those_of_the_summary(run: &Ended) {
     assert_eq!(config.run.seed, 7, "a snapshot carries its configuration");
 }
 
-fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
+fn the_evaluation_is_of_the_best_snapshot(run: &EndedRun) {
     let evaluation = run.evaluation();
     let (best, _) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
     assert_eq!(evaluation.policy_version, best.version);
     assert_eq!(evaluation.policy_sha256, best.sha256());
-    let names: Vec<_> = evaluation.courses.iter().map(|course| course.course.as_str()).collect();
-    assert_eq!(names, ["training", "non_rectangular"]);
+    let names: Vec<_> = evaluation
+        .courses
+        .iter()
+        .map(|course| course.course.as_str())
+        .collect();
+    assert_eq!(names, ["training", "non-rectangular"]);
     for course in &evaluation.courses {
-        assert_eq!(course.flights, 3);
+        assert_eq!(course.episodes, 3);
         assert_eq!(course.walls_passed.len(), 5);
         let rate = course.walls_passed.iter().sum::<u64>() as f64 / 15.0;
         assert!((course.r - rate).abs() < 1e-9, "{course:?}");
@@ -192,15 +227,16 @@ fn the_evaluation_is_of_the_best_snapshot(run: &Ended) {
     }
 }
 
-fn the_newest_checkpoint_is_of_the_end(run: &Ended) {
+fn the_newest_checkpoint_is_of_the_end(run: &EndedRun) {
     assert_eq!(
         names_in(&run.directory.checkpoints()),
-        BTreeSet::from(["flight-20".to_owned(), "flight-40".to_owned()])
+        BTreeSet::from(["episode-20".to_owned(), "episode-40".to_owned()])
     );
 }
 
-/// A record of an event file is its length, a checksum, the event, and a checksum. The first event names the format; curves go by their names.
-fn the_curves_are_in_an_event_file(run: &Ended) {
+/// An event file's record is a length, a checksum, the event, and a checksum. The first event names
+/// the format; the others hold named curves.
+fn the_curves_are_in_an_event_file(run: &EndedRun) {
     let folder = run.directory.tensorboard();
     let names = names_in(&folder);
     assert!(
@@ -216,10 +252,14 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
         events.push(event);
         rest = &after[4..];
     }
-    let holds = |event: &[u8], text: &str| event.windows(text.len()).any(|part| part == text.as_bytes());
+    let holds = |event: &[u8], text: &str| {
+        event
+            .windows(text.len())
+            .any(|part| part == text.as_bytes())
+    };
     assert!(holds(events[0], "brain.Event:2"));
     for (curve, least) in [
-        ("flight/return", 40),
+        ("episode/return", 40),
         ("window/walls_passed", 40),
         ("policy/critic_loss", 1),
         ("policy/temperature", 1),
@@ -231,9 +271,9 @@ fn the_curves_are_in_an_event_file(run: &Ended) {
     }
 }
 
-fn the_plots_show_something(run: &Ended) {
+fn the_plots_show_something(run: &EndedRun) {
     let plots = [
-        "flight_paths.png",
+        "trajectories.png",
         "reconstructions.png",
         "return.png",
         "walls_passed.png",
@@ -244,35 +284,37 @@ fn the_plots_show_something(run: &Ended) {
     );
     for plot in plots {
         let file = fs::File::open(run.directory.plots().join(plot)).unwrap();
-        let mut reader = png::Decoder::new(std::io::BufReader::new(file)).read_info().unwrap();
+        let mut reader = png::Decoder::new(std::io::BufReader::new(file))
+            .read_info()
+            .unwrap();
         let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
         let info = reader.next_frame(&mut pixels).unwrap();
         assert!(info.width >= 300 && info.height >= 150, "{plot}: {info:?}");
         let colours: BTreeSet<_> = pixels.chunks_exact(info.color_type.samples()).collect();
         assert!(
             colours.len() > 20,
-            "{plot} has {} colours: it is as good as empty",
+            "{plot} has {} colours: it is almost empty",
             colours.len()
         );
     }
 }
 
-fn every_process_has_its_log(run: &Ended) {
+fn every_process_has_its_log(run: &EndedRun) {
     for log in ["learner.log", "actor-0.log", "actor-1.log"] {
         let text = fs::read_to_string(run.directory.logs().join(log)).unwrap();
-        assert!(text.contains("INFO"), "{log} says nothing:\n{text}");
+        assert!(text.contains("INFO"), "{log} has no information:\n{text}");
         assert!(
             !text.contains("ERROR") && !text.contains("WARN"),
-            "{log} complains:\n{text}"
+            "{log} has warnings:\n{text}"
         );
     }
 }
 
-fn the_conclusion_shows_the_tables_and_the_paths(run: &Ended) {
+fn the_conclusion_shows_the_tables_and_the_paths(run: &EndedRun) {
     for part in [
-        "non_rectangular",
-        &run.summary().stages.to_string(),
-        "flights.csv",
+        "non-rectangular",
+        &skein_run::tables::stages_table(&run.summary().stages, usize::MAX),
+        "episodes.csv",
         "plots/walls_passed.png",
         "snapshots/best.safetensors",
     ] {
@@ -292,9 +334,9 @@ fn names_in(folder: &Path) -> BTreeSet<String> {
 }
 
 #[test]
-fn logs_are_as_verbose_and_of_the_format_that_was_asked_for() {
-    let run = Recipe::small()
-        .set("run.flights=10")
+fn logs_have_the_requested_level_and_format() {
+    let run = RunRecipe::small()
+        .set("run.episodes=10")
         .actors(1)
         .environment("RUST_LOG", "debug")
         .environment("SKEIN_LOG_FORMAT", "json")

@@ -1,7 +1,8 @@
-//! The depth camera: frames a second drawn, drawn with a stereo camera's errors, and traced ray by ray in the same scene.
+//! The depth camera: frames per second when drawn, drawn with a stereo camera's errors, and traced
+//! ray by ray.
 //!
-//! An iteration is a flight's worth of poses through the whole corridor, leaning as drones do, so that near walls and open corridor are in it as they
-//! are in training.
+//! An iteration renders the poses of an episode through the whole corridor, tilted like a drone, so
+//! that near walls and open corridor occur as in training.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -12,9 +13,9 @@ use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_PIXELS, Referen
 use skein_simulator::course::Course;
 use skein_simulator::disturbances::{DepthModel, DepthNoiseSettings};
 
-/// Poses drawn an iteration.
+/// Poses drawn in an iteration.
 const DRAWN: usize = 240;
-/// Poses traced an iteration: every twelfth of those drawn.
+/// Poses traced in an iteration: every twelfth of those drawn.
 const TRACED: usize = DRAWN / 12;
 
 fn main() {
@@ -27,15 +28,17 @@ fn main() {
 
 fn camera(criterion: &mut Criterion, name: &str) {
     let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-    let course = Course::load(courses.join(name).with_extension("toml")).expect("shipped courses can be flown");
+    let course = Course::load(courses.join(name).with_extension("toml"))
+        .expect("shipped courses can be flown");
     let settings = CameraSettings::default();
     let mut camera = DepthCamera::new(&settings, &course)
-        .expect("default settings make sense")
+        .expect("default settings are valid")
         .with_noise(&DepthNoiseSettings {
             model: DepthModel::Stereo,
             ..Default::default()
         });
-    let reference = ReferenceCamera::new(&settings, &course).expect("a course's surfaces are a mesh");
+    let reference =
+        ReferenceCamera::new(&settings, &course).expect("a course's surfaces form a mesh");
     let poses: Vec<_> = (0..DRAWN).map(|number| pose(&course, number)).collect();
     let mut image = [0; IMAGE_PIXELS];
 
@@ -69,14 +72,16 @@ fn camera(criterion: &mut Criterion, name: &str) {
     group.finish();
 }
 
-/// A pose of a flight that goes to each opening in turn.
+/// Returns a pose of an episode that flies through each opening in turn.
 fn pose(course: &Course, number: usize) -> Isometry3<f32> {
     let x = 1.0 + (course.corridor().length_m - 2.0) * number as f32 / DRAWN as f32;
     let ahead = course
         .walls()
         .iter()
         .find(|wall| wall.x_m() + course.wall_thickness_m() > x);
-    let [y, z] = ahead.map_or([0.0, course.corridor().height_m / 2.0], |wall| wall.safe_point());
+    let [y, z] = ahead.map_or([0.0, course.corridor().height_m / 2.0], |wall| {
+        wall.safe_point()
+    });
     let wave = number as f32 * 0.25;
     let turn = UnitQuaternion::from_euler_angles(0.4 * wave.sin(), 0.1 * wave.cos(), 0.0);
     Isometry3::from_parts(Translation3::new(x, y, z), turn)

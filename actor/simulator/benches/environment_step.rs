@@ -1,6 +1,7 @@
-//! The environment step: half a second of flight, physics alone and with the image after it.
+//! The environment step, half a second of an episode: physics alone, and with the depth image.
 //!
-//! An iteration is a whole flight through the training course, the oracle steering, take-off included.
+//! An iteration is a whole episode through the training course, flown by the oracle, with its
+//! reset.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -15,7 +16,7 @@ use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
-/// Seed of the one start that is flown from.
+/// Seed of the start position.
 const START: u64 = 1;
 
 #[derive(Clone, Copy)]
@@ -27,7 +28,9 @@ enum Camera {
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let courses = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-    let course = Arc::new(Course::load(courses.join("training.toml")).expect("shipped courses can be flown"));
+    let course = Arc::new(
+        Course::load(courses.join("training.toml")).expect("shipped courses can be flown"),
+    );
     let mut group = criterion.benchmark_group("environment_step");
     for (preset, name) in [
         (Preset::Airsim, "airsim"),
@@ -41,7 +44,8 @@ fn main() {
             },
             ..Default::default()
         };
-        let mut simulator = Simulator::new(Arc::clone(&course), &settings).expect("default settings make sense");
+        let mut simulator =
+            Simulator::new(Arc::clone(&course), &settings).expect("default settings are valid");
         group.throughput(Throughput::Elements(fly(&mut simulator, Camera::Off)));
         for (camera, what) in [(Camera::Off, "physics"), (Camera::On, "with_camera")] {
             group.bench_function(BenchmarkId::new(what, name), |bencher| {
@@ -53,7 +57,7 @@ fn main() {
     criterion.final_summary();
 }
 
-/// Flies once through the course; the number of steps it took.
+/// Flies once through the course and returns the number of steps.
 fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
     let mut image = [0; IMAGE_PIXELS];
     let mut rng = Pcg64Mcg::seed_from_u64(START);
@@ -62,7 +66,9 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
         .expect("every course has a first level");
     for steps in 1.. {
         let action = Oracle::act(simulator.course(), &simulator.state());
-        let report = simulator.step(action).expect("the oracle's commands are finite");
+        let report = simulator
+            .step(action)
+            .expect("the oracle's commands are finite");
         if let Camera::On = camera {
             simulator.render(&mut image);
             black_box(&image);
@@ -71,5 +77,5 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
             return steps;
         }
     }
-    unreachable!("the step limit ends every flight")
+    unreachable!("the step limit ends every episode")
 }

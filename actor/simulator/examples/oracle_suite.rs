@@ -1,8 +1,11 @@
-//! Flies the oracle pilot through an evaluation suite: what a pilot that knows where it is, and where the openings are, makes of the same flights.
+//! Flies the oracle through an evaluation suite, for comparison with a policy.
 //!
-//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [flights]` (configs/evaluations/generalist.toml, and as many flights as it says, by default).
-//! A policy's distance from it is what the policy could learn; the oracle's own distance from 100 % is the drone's, or its simple rule's. Depth noise does
-//! nothing to it, for it does not look.
+//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes]`
+//! (by default configs/evaluations/generalist.toml and its number of episodes).
+//!
+//! The gap between a policy and the oracle is what the policy could still learn. The gap between
+//! the oracle and 100 % is due to the drone or to the oracle's simple rule. Depth noise has no
+//! effect on the oracle, because it does not use the image.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -11,53 +14,59 @@ use std::sync::Arc;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::oracle::Oracle;
-use skein_simulator::simulator::{Obstacle, Outcome, Simulator, SimulatorSettings, StepReport};
+use skein_simulator::simulator::{
+    EpisodeOutcome, Obstacle, Simulator, SimulatorSettings, StepReport,
+};
 use skein_simulator::suite::{Suite, SuiteEntry};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
-    let shipped = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/evaluations/generalist.toml");
+    let shipped =
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/evaluations/generalist.toml");
     let suite = Suite::load(arguments.next().map_or_else(shipped, PathBuf::from))?;
-    let flights: Option<u64> = arguments.next().map(|argument| argument.parse()).transpose()?;
+    let episodes: Option<u64> = arguments
+        .next()
+        .map(|argument| argument.parse())
+        .transpose()?;
     println!(
         "{:<34} {:>7} {:>9} {:>7}  hit wall, hit corridor, timed out",
-        "entry", "flights", "completed", "R"
+        "entry", "episodes", "completed", "R"
     );
     for entry in &suite.entries {
-        println!("{}", row(entry, flights.unwrap_or(entry.flights))?);
+        println!("{}", row(entry, episodes.unwrap_or(entry.episodes))?);
     }
     Ok(())
 }
 
-/// Flies an entry and says how it went.
-fn row(entry: &SuiteEntry, flights: u64) -> Result<String, Box<dyn Error>> {
+/// Flies an entry and returns its row of the table.
+fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
     let settings = SimulatorSettings {
         disturbances: entry.disturbances.clone(),
         ..Default::default()
     };
     let (mut arrived, mut passed, mut walls) = (0, 0, 0);
     let (mut hit_wall, mut hit_corridor, mut timed_out) = (0, 0, 0);
-    for flight in 0..flights {
-        let course = entry.courses.of_flight(flight)?;
+    for episode in 0..episodes {
+        let course = entry.courses.of_episode(episode)?;
         walls += u64::from(course.levels());
-        let report = fly(Simulator::new(Arc::clone(&course), &settings)?, flight)?;
+        let report = fly(Simulator::new(Arc::clone(&course), &settings)?, episode)?;
         passed += u64::from(report.walls_passed);
         match (report.outcome, report.hit) {
-            (Some(Outcome::ReachedEnd), _) => arrived += 1,
+            (Some(EpisodeOutcome::ReachedEnd), _) => arrived += 1,
             (_, Some(Obstacle::Wall(_))) => hit_wall += 1,
             (_, Some(Obstacle::Corridor)) => hit_corridor += 1,
             (_, None) => timed_out += 1,
         }
     }
     Ok(format!(
-        "{:<34} {flights:>7} {:>7.1} % {:>7.3}  {hit_wall}, {hit_corridor}, {timed_out}",
+        "{:<34} {episodes:>7} {:>7.1} % {:>7.3}  {hit_wall}, {hit_corridor}, {timed_out}",
         entry.name,
-        100.0 * f64::from(arrived) / flights as f64,
+        100.0 * f64::from(arrived) / episodes as f64,
         passed as f64 / walls as f64,
     ))
 }
 
-/// The last step of a flight from the start of level 1.
+/// Flies an episode from the start of level 1 and returns the report of its last step.
 fn fly(mut simulator: Simulator, seed: u64) -> Result<StepReport, Box<dyn Error>> {
     let [mut start, mut disturbances] = [seed, !seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances)?;

@@ -1,7 +1,8 @@
-//! Writes what the depth camera sees before each wall of a course as PNG files.
+//! Writes depth images from before each wall of a course as PNG files.
 //!
 //! ```text
-//! cargo run --release -p skein-simulator --example render_course -- configs/courses/training.toml pictures/
+//! cargo run --release -p skein-simulator --example render_course -- \
+//!     configs/courses/training.toml pictures/
 //! ```
 
 use std::error::Error;
@@ -9,27 +10,30 @@ use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
-use skein_simulator::camera::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_simulator::camera::{
+    CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH,
+};
 use skein_simulator::course::Course;
 
-/// Metres before a wall from which it is looked at.
+/// Distance of the camera before a wall, metres.
 const BEFORE_M: f32 = 4.0;
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
     let [course, folder] = arguments.as_slice() else {
-        return Err("give a course file and a folder for the pictures".into());
+        return Err("give a course file and a folder for the images".into());
     };
     let course = Course::load(course)?;
     std::fs::create_dir_all(folder)?;
     let mut camera = DepthCamera::new(&CameraSettings::default(), &course)?;
     let mut image = [0; IMAGE_PIXELS];
     for wall in course.walls() {
-        let middle = Translation3::new(wall.x_m() - BEFORE_M, 0.0, course.corridor().height_m / 2.0);
+        let middle =
+            Translation3::new(wall.x_m() - BEFORE_M, 0.0, course.corridor().height_m / 2.0);
         let poses = [
             ("level", UnitQuaternion::identity()),
-            // As an AirSim quadrotor leans when it moves sideways at full command.
-            ("leaning", UnitQuaternion::from_euler_angles(0.4, 0.1, 0.0)),
+            // The attitude of an AirSim quadrotor that moves sideways at full command.
+            ("tilted", UnitQuaternion::from_euler_angles(0.4, 0.1, 0.0)),
         ];
         for (name, turn) in poses {
             camera.render(&Isometry3::from_parts(middle, turn), &mut image);
@@ -42,7 +46,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 fn write_png(path: &Path, image: &[u8]) -> Result<(), Box<dyn Error>> {
-    let mut encoder = png::Encoder::new(File::create(path)?, IMAGE_WIDTH as u32, IMAGE_HEIGHT as u32);
+    let mut encoder =
+        png::Encoder::new(File::create(path)?, IMAGE_WIDTH as u32, IMAGE_HEIGHT as u32);
     encoder.set_color(png::ColorType::Grayscale);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.write_header()?.write_image_data(image)?;

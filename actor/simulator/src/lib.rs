@@ -1,10 +1,22 @@
-//! The walled corridor, the quadrotor that flies it, and the depth camera it sees by.
+//! The walled corridor, the quadrotor that flies through it, and its depth camera.
 //!
-//! Usable alone: nothing here knows of actors, learners or transports. All is `f32` and deterministic: the same course, settings,
-//! start and actions give the same flight, bit for bit, on one machine type.
+//! The crate is usable alone: it knows nothing of actors, learners or transports. Everything is
+//! `f32` and deterministic. On one machine type, the same course, settings, start and actions give
+//! the same episode, bit for bit.
 //!
-//! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z up. Metres, seconds,
-//! radians, unless a name says otherwise.
+//! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z
+//! up. Units are metres, seconds and radians, unless a name says otherwise.
+//!
+//! | module | content |
+//! |---|---|
+//! | [`simulator`] | [`Simulator`](simulator::Simulator): `reset`, `step`, `render` |
+//! | [`reward`] | the four terms of the reward and their sizes |
+//! | [`course`] | corridor, walls and openings; course files; random courses |
+//! | [`vehicle`] | drone presets and their flight controller |
+//! | [`camera`] | depth image, with or without a stereo camera's errors |
+//! | [`disturbances`] | gusts, latency, mass, depth noise |
+//! | [`suite`] | evaluation suites |
+//! | [`oracle`] | a scripted expert that knows the course |
 
 pub mod camera;
 pub mod course;
@@ -12,8 +24,8 @@ pub mod disturbances;
 pub mod oracle;
 pub mod reward;
 pub mod simulator;
+mod step_report;
 pub mod suite;
 mod text;
 pub mod vehicle;
-
 mod world;

@@ -1,27 +1,33 @@
-//! A pilot that sees the course itself instead of the depth image: proof that a course can be flown by a given drone.
+//! A scripted expert that knows the course and never looks at the depth image. It proves that a
+//! given drone can fly a course.
 
 use crate::course::{Course, Wall};
 use crate::simulator::walls_ahead;
 use crate::vehicle::VehicleState;
 
-/// Velocity asked for per metre of distance to the safe point, 1/s.
+/// Commanded velocity per metre of distance to the safe point, 1/s.
 const APPROACH_PER_SEC: f32 = 0.8;
 
-/// Share of the present velocity taken off the one asked for, so that a sluggish drone does not overshoot.
+/// Share of the current velocity subtracted from the command, so that a sluggish drone does not
+/// overshoot.
 const DAMPING: f32 = 0.5;
 
-/// Flies to the next opening's safe point, and behind the last one to the middle of the corridor, where gusts find the least to blow it into.
+/// Flies to the next opening's safe point, then, behind the last wall, to the middle of the
+/// corridor, where a gust has the longest way to blow it into anything.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Oracle;
 
 impl Oracle {
-    /// The action `[v_y, v_z]` for this moment, each in [-1, 1] m/s.
+    /// Returns the action `[v_y, v_z]` for the state, m/s in the heading frame, each in [-1, 1].
     #[must_use]
     pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
         let middle = [0.0, course.corridor().height_m / 2.0];
-        let [y_m, z_m] = walls_ahead(course, state).next().map_or(middle, Wall::safe_point);
-        let steer =
-            |error_m: f32, velocity_mps: f32| (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0);
+        let [y_m, z_m] = walls_ahead(course, state)
+            .next()
+            .map_or(middle, Wall::safe_point);
+        let steer = |error_m: f32, velocity_mps: f32| {
+            (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0)
+        };
         let velocity = state.heading_velocity_mps();
         [
             steer(y_m - state.position_m.y, velocity.y),
@@ -41,17 +47,25 @@ mod tests {
 
     use super::*;
     use crate::course::test_course;
-    use crate::simulator::{Outcome, Simulator, SimulatorSettings};
+    use crate::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
     use crate::vehicle::{Preset, VehicleSettings};
 
-    /// Per course and drone, spread over the levels; `examples/oracle_flight.rs` flies a hundred from each.
-    const FLIGHTS: u64 = 10;
+    /// Episodes per course and drone, spread over the levels; `examples/oracle_episode.rs` flies a
+    /// hundred from each level.
+    const EPISODES: u64 = 10;
 
     #[test]
     fn every_shipped_course_can_be_flown_from_every_level_with_every_drone() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-        let files: Vec<_> = folder.read_dir().unwrap().map(|entry| entry.unwrap().path()).collect();
-        assert!(files.len() >= 4, "the shipped courses are missing: {files:?}");
+        let files: Vec<_> = folder
+            .read_dir()
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .collect();
+        assert!(
+            files.len() >= 4,
+            "the shipped courses are missing: {files:?}"
+        );
         for file in files {
             let course = Arc::new(Course::load(&file).unwrap());
             for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
@@ -64,15 +78,15 @@ mod tests {
                     ..Default::default()
                 };
                 let mut simulator = Simulator::new(course.clone(), &settings).unwrap();
-                for flight in 0..FLIGHTS {
-                    let level = 1 + (flight % u64::from(course.levels())) as u8;
-                    let [mut start, mut calm] = [flight, 0].map(Pcg64Mcg::seed_from_u64);
+                for episode in 0..EPISODES {
+                    let level = 1 + (episode % u64::from(course.levels())) as u8;
+                    let [mut start, mut calm] = [episode, 0].map(Pcg64Mcg::seed_from_u64);
                     simulator.reset(level, &mut start, &mut calm).unwrap();
                     let outcome = fly(&mut simulator);
                     let at = simulator.state().position_m;
                     assert_eq!(
                         outcome,
-                        Outcome::ReachedEnd,
+                        EpisodeOutcome::ReachedEnd,
                         "{}, {preset:?}, level {level}: at {at}",
                         course.name()
                     );
@@ -81,7 +95,7 @@ mod tests {
         }
     }
 
-    fn fly(simulator: &mut Simulator) -> Outcome {
+    fn fly(simulator: &mut Simulator) -> EpisodeOutcome {
         loop {
             let action = Oracle::act(simulator.course(), &simulator.state());
             if let Some(outcome) = simulator.step(action).unwrap().outcome {
@@ -91,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn pilot_steers_towards_the_opening_and_brakes_before_it() {
+    fn oracle_steers_towards_the_opening_and_brakes_before_it() {
         let course = test_course();
         let [y_m, z_m] = course.walls()[0].safe_point();
         let below_right = VehicleState::at_rest(Point3::new(5.0, y_m - 2.0, z_m - 2.0));
@@ -104,11 +118,15 @@ mod tests {
     }
 
     #[test]
-    fn pilot_holds_still_until_its_tail_has_left_the_wall() {
+    fn oracle_holds_still_until_its_tail_has_left_the_wall() {
         let course = test_course();
         let wall = &course.walls()[0];
         let [y_m, z_m] = wall.safe_point();
-        let inside = VehicleState::at_rest(Point3::new(wall.x_m() + course.wall_thickness_m() + 0.5, y_m, z_m));
+        let inside = VehicleState::at_rest(Point3::new(
+            wall.x_m() + course.wall_thickness_m() + 0.5,
+            y_m,
+            z_m,
+        ));
         assert_eq!(Oracle::act(&course, &inside), [0.0, 0.0]);
     }
 }

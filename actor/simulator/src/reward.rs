@@ -1,55 +1,95 @@
-//! The paper's reward: a penalty for colliding, bonuses for passing a wall and for arriving, and one for looking into free space.
+//! The paper's reward: four terms, added up in every step.
 //!
-//! Its Table 1, which holds the numbers, is lost; the defaults are of our choosing and were enough to learn the task.
+//! `reward_terms!` lists them: settings, records, curves and recordings follow from the list.
+//!
+//! | term | given when | value | default |
+//! |---|---|---|---|
+//! | `collision` | the step ends in a collision | the setting, a penalty | −1 |
+//! | `level_up` | the drone passes a wall in the step | the setting, a bonus | 1 |
+//! | `destination` | the step reaches the end wall | the setting, a bonus | 1 |
+//! | `open_view` | in every step | the setting `k` times a view contrast in [-1, 1] | `k` = 1 |
+//!
+//! `open_view` rewards looking into open space: its contrast is the mean depth of the image's
+//! central 16 × 16 pixels minus the mean depth of the whole image. The paper calls it the "action
+//! reward". It is positive when the view ahead is deeper than the rest of the image.
+//!
+//! Rewards have no unit. The paper's Table 1, which holds its values, is lost; the defaults are our
+//! choice and suffice to learn the task.
+//!
+//! Source: Xue & Gonsalves 2021, section on the reward function.
 
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
-use crate::simulator::{LevelUp, Outcome, StepReport};
+use crate::step_report::{EpisodeOutcome, LevelUp, StepReport};
 
-/// Edge of the square in the image's middle that the action reward looks at, pixels.
+/// Side of the central square that [`RewardTerms::open_view`] looks at, pixels.
 const CENTRE_SIDE: usize = 16;
 
-/// Largest reward, either way, that can be set.
+/// Largest magnitude accepted for a setting.
 const MAX_REWARD: f32 = 1e6;
 
-/// Size of each reward term.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RewardSettings {
-    /// Given on collision. Default −1.
-    pub collision: f32,
-    /// Given when a wall has been passed. Default 1.
-    pub level_up: f32,
-    /// Given on reaching the end wall. Default 1.
-    pub destination: f32,
-    /// Factor `k` of the action reward. Default 1.
-    pub action_scale: f32,
+/// Declares the terms: for each, its documentation, its name and the default of its setting. The
+/// order is that of their sum.
+macro_rules! reward_terms {
+    ($($(#[$doc:meta])* $name:ident = $default:literal),+ $(,)?) => {
+        /// Size of each reward term: section `[simulator.reward]`.
+        #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct RewardSettings {
+            $($(#[$doc])* pub $name: f32),+
+        }
+
+        impl Default for RewardSettings {
+            fn default() -> Self {
+                Self { $($name: $default),+ }
+            }
+        }
+
+        impl RewardSettings {
+            fn by_key(&self) -> [(&'static str, f32); RewardTerms::NAMES.len()] {
+                [$((stringify!($name), self.$name)),+]
+            }
+        }
+
+        /// The reward of one step, term by term: 0 for what did not happen in it.
+        #[derive(Debug, Clone, Copy, Default, PartialEq)]
+        pub struct RewardTerms {
+            $($(#[$doc])* pub $name: f32),+
+        }
+
+        impl RewardTerms {
+            /// Names of all terms, in the order of their sum.
+            pub const NAMES: &[&str] = &[$(stringify!($name)),+];
+
+            /// Returns the values, in the order of [`RewardTerms::NAMES`].
+            pub fn values(&self) -> [f32; Self::NAMES.len()] {
+                [$(self.$name),+]
+            }
+        }
+    };
 }
 
-impl Default for RewardSettings {
-    fn default() -> Self {
-        Self {
-            collision: -1.0,
-            level_up: 1.0,
-            destination: 1.0,
-            action_scale: 1.0,
-        }
-    }
+reward_terms! {
+    /// Given when the step ends in a collision. Default −1.
+    collision = -1.0,
+    /// Given when the drone passes a wall in the step. Default 1.
+    level_up = 1.0,
+    /// Given when the step reaches the end wall. Default 1.
+    destination = 1.0,
+    /// `k · (mean of the central 16 × 16 pixels − mean of the whole depth image)`, pixels scaled to
+    /// [0, 1], given in every step: between −k and k. The setting is the factor `k`. Default 1; 0
+    /// rewards events only.
+    open_view = 1.0,
 }
 
 impl RewardSettings {
-    /// Checks that every reward is a number that sums of rewards can hold.
+    /// Checks that every setting is a number whose sums stay finite.
     ///
     /// # Errors
-    /// [`RewardSettingsError`] names the key.
+    /// [`RewardSettingsError`] names the first key at fault.
     pub fn validate(&self) -> Result<(), RewardSettingsError> {
-        for (key, value) in [
-            ("collision", self.collision),
-            ("level_up", self.level_up),
-            ("destination", self.destination),
-            ("action_scale", self.action_scale),
-        ] {
+        for (key, value) in self.by_key() {
             if !(-MAX_REWARD..=MAX_REWARD).contains(&value) {
                 return Err(RewardSettingsError { key, value });
             }
@@ -58,10 +98,11 @@ impl RewardSettings {
     }
 }
 
-/// A reward no critic can learn.
+/// A reward setting that is out of bounds.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 #[error(
-    "[simulator.reward] {key} = {value} is outside [-{MAX_REWARD}, {MAX_REWARD}]: no critic can learn returns of that size"
+    "[simulator.reward] {key} = {value} is outside -{MAX_REWARD} to {MAX_REWARD}: no critic can \
+     learn returns of that size"
 )]
 pub struct RewardSettingsError {
     /// The key.
@@ -70,47 +111,38 @@ pub struct RewardSettingsError {
     pub value: f32,
 }
 
-/// What each term gave in one step.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct RewardTerms {
-    /// [`RewardSettings::collision`] if the step ended in a collision, else 0.
-    pub collision: f32,
-    /// [`RewardSettings::level_up`] if a wall was passed in the step, else 0.
-    pub level_up: f32,
-    /// [`RewardSettings::destination`] if the step reached the end wall, else 0.
-    pub destination: f32,
-    /// `k · (mean of the central 16 × 16 pixels − mean of the whole depth image)`, both in [0, 1].
-    pub action: f32,
-}
-
 impl RewardTerms {
-    /// Terms of the step that `report` tells of and after which the camera saw `image_after`.
-    ///
-    /// Source: Xue & Gonsalves 2021, section on the reward function.
-    pub fn of(settings: &RewardSettings, report: &StepReport, image_after: &[u8; IMAGE_PIXELS]) -> Self {
+    /// Returns the terms of a step with the result `report`, after which the camera saw
+    /// `image_after`.
+    pub fn of(
+        settings: &RewardSettings,
+        report: &StepReport,
+        image_after: &[u8; IMAGE_PIXELS],
+    ) -> Self {
         let mut terms = Self {
-            action: settings.action_scale * centre_minus_whole(image_after),
+            open_view: settings.open_view * centre_minus_whole(image_after),
             ..Self::default()
         };
-        if report.outcome == Some(Outcome::Collided) {
+        if report.outcome == Some(EpisodeOutcome::Collided) {
             terms.collision = settings.collision;
         }
         if report.level_up == LevelUp::Yes {
             terms.level_up = settings.level_up;
         }
-        if report.outcome == Some(Outcome::ReachedEnd) {
+        if report.outcome == Some(EpisodeOutcome::ReachedEnd) {
             terms.destination = settings.destination;
         }
         terms
     }
 
-    /// The reward the agent learns from.
+    /// Returns the sum of the terms: the reward the agent learns from.
     pub fn total(&self) -> f32 {
-        self.collision + self.level_up + self.destination + self.action
+        let [first, rest @ ..] = self.values();
+        rest.into_iter().fold(first, |sum, term| sum + term)
     }
 }
 
-/// How much deeper the image's middle is than the whole, in [-1, 1].
+/// Returns how much deeper the image's centre is than the whole image, in [-1, 1].
 fn centre_minus_whole(image: &[u8; IMAGE_PIXELS]) -> f32 {
     const TOP: usize = (IMAGE_HEIGHT - CENTRE_SIDE) / 2;
     const LEFT: usize = (IMAGE_WIDTH - CENTRE_SIDE) / 2;
@@ -129,7 +161,7 @@ fn centre_minus_whole(image: &[u8; IMAGE_PIXELS]) -> f32 {
 mod tests {
     use super::*;
 
-    fn report(level_up: LevelUp, outcome: Option<Outcome>) -> StepReport {
+    fn report(level_up: LevelUp, outcome: Option<EpisodeOutcome>) -> StepReport {
         StepReport {
             walls_passed: 1,
             level_up,
@@ -139,38 +171,60 @@ mod tests {
     }
 
     #[test]
-    fn a_reward_that_is_no_number_is_refused_by_key() {
+    fn a_reward_out_of_bounds_is_refused_by_key() {
         for value in [f32::NAN, f32::INFINITY, -2e6] {
             let settings = RewardSettings {
                 collision: value,
                 ..RewardSettings::default()
             };
             let refusal = settings.validate().unwrap_err().to_string();
-            assert!(refusal.contains("[simulator.reward] collision ="), "{refusal}");
+            assert!(
+                refusal.contains("[simulator.reward] collision ="),
+                "{refusal}"
+            );
         }
         assert_eq!(RewardSettings::default().validate(), Ok(()));
     }
 
     #[test]
-    fn action_term_is_centre_minus_whole() {
+    fn every_term_is_a_setting_a_value_and_a_summand_under_one_name() {
+        let keys = RewardSettings::default().by_key().map(|(key, _)| key);
+        assert_eq!(keys, RewardTerms::NAMES);
+        let terms = RewardTerms {
+            collision: 1e8,
+            level_up: 1.0,
+            open_view: -1e8,
+            ..RewardTerms::default()
+        };
+        assert_eq!(terms.values()[..4], [1e8, 1.0, 0.0, -1e8]);
+        // In this order the 1 is lost, in others it is not.
+        assert_eq!(terms.total(), 0.0);
+    }
+
+    #[test]
+    fn open_view_is_centre_minus_whole() {
         let mut image = [51; IMAGE_PIXELS];
         for row in 28..44 {
             image[row * IMAGE_WIDTH + 56..row * IMAGE_WIDTH + 72].fill(255);
         }
-        let terms = RewardTerms::of(&RewardSettings::default(), &report(LevelUp::No, None), &image);
-        // 256 of 9216 pixels are 1, the rest 0.2: mean 0.2 + 0.8 / 36.
-        assert!((terms.action - (1.0 - (0.2 + 0.8 / 36.0))).abs() < 1e-6);
-        assert_eq!(terms.total(), terms.action);
+        let terms = RewardTerms::of(
+            &RewardSettings::default(),
+            &report(LevelUp::No, None),
+            &image,
+        );
+        // 256 of 9216 pixels are 1, the others 0.2: the mean is 0.2 + 0.8 / 36.
+        assert!((terms.open_view - (1.0 - (0.2 + 0.8 / 36.0))).abs() < 1e-6);
+        assert_eq!(terms.total(), terms.open_view);
     }
 
     #[test]
-    fn even_image_rewards_nothing() {
+    fn even_image_gives_no_open_view_reward() {
         let terms = RewardTerms::of(
             &RewardSettings::default(),
             &report(LevelUp::No, None),
             &[200; IMAGE_PIXELS],
         );
-        assert!(terms.action.abs() < 1e-6);
+        assert!(terms.open_view.abs() < 1e-6);
     }
 
     #[test]
@@ -182,10 +236,13 @@ mod tests {
         };
         let terms = RewardTerms::of(
             &settings,
-            &report(LevelUp::Yes, Some(Outcome::Collided)),
+            &report(LevelUp::Yes, Some(EpisodeOutcome::Collided)),
             &[0; IMAGE_PIXELS],
         );
-        assert_eq!((terms.collision, terms.level_up, terms.destination), (-3.0, 2.0, 0.0));
+        assert_eq!(
+            (terms.collision, terms.level_up, terms.destination),
+            (-3.0, 2.0, 0.0)
+        );
         assert_eq!(terms.total(), -1.0);
     }
 
@@ -193,7 +250,7 @@ mod tests {
     fn running_out_of_time_is_neither_collision_nor_arrival() {
         let terms = RewardTerms::of(
             &RewardSettings::default(),
-            &report(LevelUp::No, Some(Outcome::TimedOut)),
+            &report(LevelUp::No, Some(EpisodeOutcome::TimedOut)),
             &[0; IMAGE_PIXELS],
         );
         assert_eq!(terms.total(), 0.0);

@@ -1,4 +1,4 @@
-//! What the comments in `configs/courses/` claim.
+//! Checks the claims of the comments in `configs/courses/`.
 
 use std::path::PathBuf;
 
@@ -35,7 +35,12 @@ fn rearranged_courses_hold_the_walls_of_training() {
                 .iter()
                 .find(|other| other.label() == wall.label())
                 .unwrap();
-            assert_eq!(wall.opening(), same.opening(), "{name}: wall {}", wall.label());
+            assert_eq!(
+                wall.opening(),
+                same.opening(),
+                "{name}: wall {}",
+                wall.label()
+            );
         }
     }
 }
@@ -56,7 +61,7 @@ fn walls_stand_every_ten_metres() {
 }
 
 #[test]
-fn every_opening_leaves_the_same_free_space() {
+fn every_opening_leaves_about_the_same_free_space() {
     for name in ["training.toml", "non_rectangular.toml"] {
         for wall in shipped(name).walls() {
             assert!(
@@ -77,12 +82,12 @@ fn every_opening_leaves_the_same_free_space() {
 }
 
 #[test]
-fn straight_flight_passes_no_wall() {
+fn an_episode_straight_ahead_passes_no_wall() {
     for name in ["training.toml", "non_rectangular.toml"] {
         let course = shipped(name);
         let start = course.start();
         let middle_z = course.corridor().height_m / 2.0;
-        // The whole body fits nowhere in the start area's shadow: some end of it meets the wall.
+        // From no start position does the whole body fit: some end of it meets the wall.
         for (i, j) in (-10..=10).flat_map(|i| (-10..=10).map(move |j| (i, j))) {
             let y = start.jitter_y_m * i as f32 / 10.0;
             let z = middle_z + start.jitter_z_m * j as f32 / 10.0;
@@ -97,7 +102,7 @@ fn straight_flight_passes_no_wall() {
     }
 }
 
-/// Whether the point lies in the polygon, by the parity of crossings.
+/// Returns `true` if the point lies in the polygon, by the parity of crossings.
 fn inside(points: &[[f32; 2]], [y, z]: [f32; 2]) -> bool {
     let edges = points.iter().zip(points.iter().cycle().skip(1));
     edges

@@ -1,28 +1,28 @@
+use std::path::Path;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use skein_protocol::ids::{Attempt, FlightId, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, Presence, RunDirectory};
-use skein_protocol::services::LearnerPorts;
-use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::stages::{Stage, Thread};
+use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::stages::{Stage, ThreadRole};
 use skein_protocol::status::ActorStatus;
 use skein_protocol::ticket::{ControlRecord, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
+use skein_run::{LearnerLock, Presence, RunDirectory};
+use skein_transport::LearnerPorts;
 
 use super::*;
-use crate::agent::Agent;
-use crate::courses::{Courses, Simulators};
-use crate::testing::{config, random_snapshot};
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::{Courses, Simulators};
 
 const ACTOR: ActorId = ActorId(0);
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// A run with a learner of the test's own and one actor on a thread.
+/// Run whose learner is the test itself, with one actor on a thread.
 struct Run {
-    learner: Option<(LearnerPorts, LearnerSeat)>,
-    told_to_end: Arc<AtomicBool>,
-    actor: Option<JoinHandle<Result<Ending, JoinError>>>,
+    learner: Option<(LearnerPorts, LearnerLock)>,
+    exit_requested: Arc<AtomicBool>,
+    actor: Option<JoinHandle<Result<ExitReason, JoinError>>>,
     identity: RunIdentity,
     config: Config,
     directory: tempfile::TempDir,
@@ -32,36 +32,42 @@ impl Run {
     fn start(learner_silence_secs: f64) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        let mut config = config("");
+        let mut config = Config::default();
+        config.sac.hidden_width = 16;
+        let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs");
+        for path in config.courses.paths_mut() {
+            *path = configs.join(&*path);
+        }
         config.transport.max_actors = 2;
         config.transport.learner_silence_secs = learner_silence_secs;
         run.create(&config).unwrap();
         let (identity, config) = run.open().unwrap();
-        let told_to_end = Arc::new(AtomicBool::new(false));
+        let exit_requested = Arc::new(AtomicBool::new(false));
         let mut started = Self {
             learner: None,
-            told_to_end: Arc::clone(&told_to_end),
+            exit_requested: Arc::clone(&exit_requested),
             actor: None,
             identity: identity.clone(),
             config: config.clone(),
             directory,
         };
-        started.begin_life();
+        started.begin_incarnation();
         started.actor = Some(std::thread::spawn(move || {
             let _presence = Presence::enter(&identity).unwrap();
             let courses = Arc::new(Courses::of_run(&config).unwrap());
-            let agent = Agent::new(config.view());
-            let mut pilot = Pilot::new(ACTOR, Incarnation(0), Simulators::new(courses), agent);
-            Service::new(&identity, &config, ACTOR, &told_to_end).serve(&mut pilot)
+            let agent = Agent::new(config.observation_layout());
+            let mut environment_loop =
+                EnvironmentLoop::new(ACTOR, ActorIncarnation(0), Simulators::new(courses), agent);
+            Service::new(&identity, &config, ACTOR, &exit_requested).serve(&mut environment_loop)
         }));
         started
     }
 
-    fn begin_life(&mut self) {
+    fn begin_incarnation(&mut self) {
         let directory = RunDirectory::new(self.directory.path());
-        let seat = LearnerSeat::take(&directory, &self.identity).unwrap();
-        let ports = LearnerPorts::open(&self.identity, seat.life(), &self.config).unwrap();
-        self.learner = Some((ports, seat));
+        let lock = LearnerLock::take(&directory, &self.identity).unwrap();
+        let ports = LearnerPorts::open(&self.identity, lock.incarnation(), &self.config).unwrap();
+        self.learner = Some((ports, lock));
     }
 
     fn learner(&self) -> &LearnerPorts {
@@ -71,30 +77,32 @@ impl Run {
     fn ticket(&self, version: u64) -> Ticket {
         Ticket {
             run: self.identity.run,
-            flight: FlightId(4),
+            episode: EpisodeId(4),
             attempt: Attempt(0),
             policy_version: PolicyVersion(version),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 6,
-            leg: None,
+            segment: None,
         }
     }
 
     fn publish(&self, version: u64) {
-        self.learner()
-            .publish(&random_snapshot(&SnapshotLayout::of(&self.config), version))
-            .unwrap();
+        let snapshot = Snapshot {
+            version: PolicyVersion(version),
+            values: vec![0.01; SnapshotLayout::of(&self.config).values()],
+        };
+        self.learner().publish(&snapshot).unwrap();
         self.learner().wake_actors().unwrap();
     }
 
-    fn say(&self, record: ControlRecord) {
+    fn send(&self, record: ControlRecord) {
         self.learner().send_control(record).unwrap();
         self.learner().wake_actors().unwrap();
     }
 
-    /// Looks for something until it is there.
+    /// Repeats `look` until it succeeds.
     fn until<T>(&self, what: &str, mut look: impl FnMut() -> Option<T>) -> T {
         let start = Instant::now();
         loop {
@@ -109,24 +117,28 @@ impl Run {
 
     fn until_status(&self, what: &str, holds: impl Fn(&ActorStatus) -> bool) -> ActorStatus {
         self.until(what, || {
-            let status = self.learner().receive_status().unwrap()?.read(self.identity.run)?;
+            let status = self
+                .learner()
+                .receive_status()
+                .unwrap()?
+                .read(self.identity.run)?;
             holds(&status).then_some(status)
         })
     }
 
-    fn joined(&self) -> Incarnation {
+    fn joined(&self) -> ActorIncarnation {
         self.until_status("an actor", |status| status.state == ActorState::Serving)
             .incarnation
     }
 
-    fn ending(&mut self) -> Ending {
+    fn ending(&mut self) -> ExitReason {
         self.actor.take().unwrap().join().unwrap().unwrap()
     }
 }
 
 impl Drop for Run {
     fn drop(&mut self) {
-        self.told_to_end.store(true, Ordering::Relaxed);
+        self.exit_requested.store(true, Ordering::Relaxed);
         if let Some(actor) = self.actor.take() {
             let _ = actor.join();
         }
@@ -140,13 +152,13 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     let incarnation = run.joined();
     run.publish(1);
     let ticket = run.ticket(1);
-    // For another life of this actor: not to be flown.
+    // For another incarnation of this actor: not to be flown.
     let other = Ticket {
-        flight: FlightId(99),
+        episode: EpisodeId(99),
         ..ticket.clone()
     };
-    run.say(ControlRecord::fly(&other, ACTOR, Incarnation(1)));
-    run.say(ControlRecord::fly(&ticket, ACTOR, incarnation));
+    run.send(ControlRecord::fly(&other, ACTOR, ActorIncarnation(1)));
+    run.send(ControlRecord::fly(&ticket, ACTOR, incarnation));
     let mut steps = 0;
     for step in 0.. {
         steps = u64::from(step);
@@ -155,14 +167,22 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
             assert!(step > 3 && Outcome::from_code(record.outcome).is_some());
             break;
         }
-        assert_eq!(record.check(&ticket, ACTOR, incarnation, step), Ok(RecordKind::Step));
+        assert_eq!(
+            record.check(&ticket, ACTOR, incarnation, step),
+            Ok(RecordKind::Step)
+        );
     }
-    run.say(ControlRecord::stop(run.identity.run));
-    let last = run.until_status("the last word", |status| status.state == ActorState::Leaving);
-    assert_eq!((last.flights_flown, last.newest_policy), (1, Some(PolicyVersion(1))));
+    run.send(ControlRecord::stop(run.identity.run));
+    let last = run.until_status("the last status", |status| {
+        status.state == ActorState::Leaving
+    });
+    assert_eq!(
+        (last.episodes_flown, last.newest_policy),
+        (1, Some(PolicyVersion(1)))
+    );
     let done = [
         Stage::TakeSnapshot,
-        Stage::TakeOff,
+        Stage::Reset,
         Stage::Physics,
         Stage::Camera,
         Stage::Encoder,
@@ -171,22 +191,22 @@ fn an_actor_flies_its_ticket_and_leaves_when_the_run_is_over() {
     ]
     .map(|stage| last.times.of(stage).count);
     assert_eq!(done, [1, 1, steps, steps + 1, steps + 1, steps, steps + 1]);
-    let total = Duration::from_nanos(last.times.total_nanos(Thread::Actors));
+    let total = Duration::from_nanos(last.times.total_nanos(ThreadRole::Actors));
     assert!(total <= begun.elapsed() && total > Duration::ZERO);
-    assert_eq!(run.ending(), Ending::Stopped);
+    assert_eq!(run.ending(), ExitReason::Stopped);
     assert!(run.learner().receive_transition().unwrap().is_none());
 }
 
 #[test]
-fn a_ticket_waits_for_its_snapshot_and_no_other_is_flown_in_its_stead() {
+fn a_ticket_waits_for_its_snapshot_and_is_flown_with_no_other() {
     let run = Run::start(30.0);
     let incarnation = run.joined();
     run.publish(1);
-    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, incarnation));
+    run.send(ControlRecord::fly(&run.ticket(2), ACTOR, incarnation));
     run.until_status("the first snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(1))
     });
-    run.until_status("a sign of life later", |_| true);
+    run.until_status("a heartbeat later", |_| true);
     assert!(run.learner().receive_transition().unwrap().is_none());
     run.publish(2);
     let record = run.until("a record", || run.learner().receive_transition().unwrap());
@@ -197,20 +217,20 @@ fn a_ticket_waits_for_its_snapshot_and_no_other_is_flown_in_its_stead() {
 }
 
 #[test]
-fn a_learner_silent_for_too_long_is_left() {
+fn an_actor_exits_when_the_learner_is_silent_for_too_long() {
     let mut run = Run::start(0.3);
-    assert_eq!(run.ending(), Ending::LearnerSilent);
+    assert_eq!(run.ending(), ExitReason::LearnerSilent);
 }
 
 #[test]
-fn a_learner_that_is_gone_for_too_long_is_not_waited_for() {
+fn an_actor_exits_when_the_learner_is_gone_for_too_long() {
     let mut run = Run::start(1.0);
     run.joined();
     run.learner = None;
-    assert_eq!(run.ending(), Ending::LearnerSilent);
+    assert_eq!(run.ending(), ExitReason::LearnerSilent);
     assert!(
         !run.identity.transport_folder().exists(),
-        "the last one to go removes it"
+        "the last process removes it"
     );
 }
 
@@ -219,11 +239,11 @@ fn an_actor_without_a_learner_ends_at_a_signal() {
     let mut run = Run::start(30.0);
     run.joined();
     run.learner = None;
-    std::thread::sleep(3 * SEEK_INTERVAL);
-    run.told_to_end.store(true, Ordering::Relaxed);
-    let told = Instant::now();
-    assert_eq!(run.ending(), Ending::Signalled);
-    assert!(told.elapsed() < Duration::from_secs(2));
+    std::thread::sleep(3 * JOIN_INTERVAL);
+    run.exit_requested.store(true, Ordering::Relaxed);
+    let requested = Instant::now();
+    assert_eq!(run.ending(), ExitReason::Signalled);
+    assert!(requested.elapsed() < Duration::from_secs(2));
 }
 
 #[test]
@@ -233,36 +253,40 @@ fn heartbeats_keep_an_actor_and_a_signal_ends_it() {
     let start = Instant::now();
     while start.elapsed() < Duration::from_millis(1200) {
         run.learner().maintain().unwrap();
-        run.say(ControlRecord::heartbeat(run.identity.run));
+        run.send(ControlRecord::heartbeat(run.identity.run));
         std::thread::sleep(Duration::from_millis(50));
     }
     assert!(!run.actor.as_ref().unwrap().is_finished());
-    run.told_to_end.store(true, Ordering::Relaxed);
-    assert_eq!(run.ending(), Ending::Signalled);
+    run.exit_requested.store(true, Ordering::Relaxed);
+    assert_eq!(run.ending(), ExitReason::Signalled);
 }
 
 #[test]
-fn an_actor_joins_the_learners_next_life_with_nothing_of_the_former_one() {
+fn an_actor_joins_the_next_learner_incarnation_with_empty_state() {
     let mut run = Run::start(30.0);
     let former = run.joined();
-    // Waits for a snapshot that never comes, and would be flown in the next life if it were taken along.
-    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, former));
+    // This ticket waits for a snapshot. If the next incarnation kept it, it would be flown there.
+    run.send(ControlRecord::fly(&run.ticket(2), ACTOR, former));
     run.publish(1);
     run.until_status("the first snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(1))
     });
     run.learner = None;
-    run.begin_life();
-    let status = run.until_status("the actor in the next life", |_| true);
+    run.begin_incarnation();
+    let status = run.until_status("the actor in the next incarnation", |_| true);
     assert!(status.incarnation > former);
     assert_eq!(status.newest_policy, None);
     run.publish(2);
     run.until_status("the second snapshot", |status| {
         status.newest_policy == Some(PolicyVersion(2))
     });
-    run.until_status("a sign of life later", |_| true);
+    run.until_status("a heartbeat later", |_| true);
     assert!(run.learner().receive_transition().unwrap().is_none());
-    run.say(ControlRecord::fly(&run.ticket(2), ACTOR, status.incarnation));
+    run.send(ControlRecord::fly(
+        &run.ticket(2),
+        ACTOR,
+        status.incarnation,
+    ));
     let record = run.until("a record", || run.learner().receive_transition().unwrap());
     assert_eq!(
         record.check(&run.ticket(2), ACTOR, status.incarnation, 0),

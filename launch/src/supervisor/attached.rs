@@ -1,30 +1,38 @@
-//! Actors that were added to a run under way. Its learner is none of their supervisor's business: they find it, and its next lives, by themselves.
+//! Actors added to a run that is under way. They find its learner, and later incarnations of the
+//! learner, on their own; their supervisor does not manage it.
 
-use skein_protocol::summary::Summary;
 use tokio::sync::mpsc;
 use tokio::time::{Duration, Instant, interval};
 
 use super::crew::{Crew, GivenUp};
 use super::dismissal::dismiss;
-use super::process::Order;
-use super::{EVENTS, Ended, Event, Plan, SupervisorError, Watcher};
+use super::memory::MemoryWatch;
+use super::process::ProcessOrder;
+use super::{EVENTS, Ended, SupervisionPlan, SupervisorError, SupervisorEvent, Watcher};
 
-/// Between two looks whether the run is still under way.
+/// Time between two checks whether the run is still under way.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// Supervises actors that join a run under way, until they end. They do so by themselves when the run does; those that cannot are ended when
-/// `is_under_way` has said no for [`Deadlines::actor_silence`](super::Deadlines).
+/// Supervises actors that join a run under way, until they end. Actors end by themselves when the
+/// run does. Any that remain are ended once `is_under_way` has returned `false` for
+/// [`Deadlines::actor_silence`](super::Deadlines).
 ///
 /// # Errors
 /// As [`run`](super::run).
 pub async fn attach(
-    plan: &Plan,
+    plan: &SupervisionPlan,
     is_under_way: impl Fn() -> bool,
     interrupts: &mut mpsc::Receiver<()>,
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
-    let mut crew = Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events);
+    let mut crew = Crew::new(
+        &plan.run,
+        &plan.programs.actor,
+        &plan.actors,
+        events,
+        MemoryWatch::new(),
+    );
     if let Err(error) = crew.start() {
         dismiss(&mut crew, &mut inbox, interrupts).await;
         return Err(error);
@@ -34,12 +42,14 @@ pub async fn attach(
     while crew.is_alive() && ended == Ended::Finished {
         tokio::select! {
             Some(event) = inbox.recv() => match event {
-                Event::ActorExited(number, exit) => crew.exited(number, &exit),
-                Event::ActorDue(number) => crew.restart(number),
-                Event::LearnerSaid(_) | Event::LearnerExited(_) | Event::LearnerDue => {}
+                SupervisorEvent::ActorExited(number, exit) => crew.exited(number, &exit),
+                SupervisorEvent::ActorDue(number) => crew.restart(number),
+                SupervisorEvent::LearnerSaid(_)
+                | SupervisorEvent::LearnerExited(_)
+                | SupervisorEvent::LearnerDue => {}
             },
             Some(()) = interrupts.recv() => {
-                crew.order(Order::Terminate);
+                crew.order(ProcessOrder::Terminate);
                 ended = Ended::Interrupted;
             }
             _ = look.tick() => {
@@ -56,8 +66,8 @@ pub async fn attach(
     }
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match crew.last_failure() {
-        // Whoever came or was started again as the run ended heard nothing of its end.
-        Some(GivenUp::LearnerGone) if Summary::of(&plan.run).is_some() => Ok(ended),
+        // An actor that started or restarted while the run ended was not notified of the end.
+        Some(GivenUp::LearnerGone) if plan.run.summary().is_some() => Ok(ended),
         Some(reason) if ended == Ended::Finished => Err(match reason {
             GivenUp::LearnerGone => SupervisorError::LearnerGone(plan.run.root().to_owned()),
             GivenUp::KeepsDying(_) => SupervisorError::NoActors(reason.to_string()),

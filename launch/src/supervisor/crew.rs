@@ -1,4 +1,4 @@
-//! The actors of one supervisor: started, watched, restarted when they die, told to end.
+//! Actors of one supervisor: starts, watches, restarts and ends them.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -7,77 +7,79 @@ use std::path::Path;
 use std::time::Duration;
 
 use skein_protocol::ids::ActorId;
-use skein_protocol::run::RunDirectory;
+use skein_run::RunDirectory;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep};
 
-use super::log_tail::log_tail;
-use super::memory::want_of_memory;
-use super::process::{Exit, Launch, Order, Output, reap};
-use super::restarts::{ActorDeaths, Life, Verdict};
-use super::work::Work;
-use super::{Event, SupervisorError};
-use crate::prepare::room::free_shared_memory;
+use super::memory::{MemoryShortage, MemoryWatch};
+use super::process::{Exit, Output, ProcessLaunch, ProcessOrder, reap};
+use super::restarts::{ActorDeaths, IncarnationUse, RestartDecision};
+use super::work::WorkDone;
+use super::{SupervisorError, SupervisorEvent};
+use skein_run::log_tail::log_tail;
 
-/// A life that lasted so long was a good start, whether or not there are reports that show it.
+/// An incarnation that lasted this long started successfully, even if no reports prove it.
 const GOOD_START: Duration = Duration::from_secs(10);
 
 /// The actors of one supervisor.
 pub(super) struct Crew<'a> {
     run: &'a RunDirectory,
     program: &'a Path,
-    events: mpsc::Sender<Event>,
+    events: mpsc::Sender<SupervisorEvent>,
     members: Vec<Member>,
-    /// What the learner last reported; `None` while there is none that reports, or nobody listens to it.
-    work: Option<Work>,
+    /// Work done by the run as last reported; `None` while no learner reports, or if this
+    /// supervisor does not listen to it.
+    work: Option<WorkDone>,
     after_death: AfterDeath,
     last_failure: Option<GivenUp>,
     restarts: u64,
-    /// What the user should be told, oldest first.
+    /// Warnings for the user, oldest first.
     warnings: VecDeque<String>,
+    memory: MemoryWatch,
 }
 
-/// One actor, through all its lives.
+/// One actor, across all its incarnations.
 struct Member {
     id: ActorId,
-    state: State,
+    state: ActorState,
     deaths: ActorDeaths,
-    standing: Standing,
-    /// What the run had done when the present life began.
-    work_before: Option<Work>,
+    standing: ActorStanding,
+    /// Work done by the run when the present incarnation began.
+    work_before: Option<WorkDone>,
 }
 
-enum State {
+enum ActorState {
     /// A process is alive.
-    Flying(Process),
-    /// Died; will be started again.
+    Flying(ActorProcess),
+    /// Died; restarts after a pause.
     Resting,
-    /// Was sent home, found no learner, or failed too often; will be started again when a learner reports for the first time.
+    /// Was dismissed, found no learner, or failed too often; restarts when a learner reports for
+    /// the first time.
     Stranded,
     /// Not started, or ended.
     Gone,
 }
 
-struct Process {
-    orders: watch::Sender<Order>,
+struct ActorProcess {
+    orders: watch::Sender<ProcessOrder>,
     started: Instant,
-    /// When the learner last counted it among its actors; its start, before that.
+    /// Time when the learner last counted it among its actors; initially its start.
     heard_of: Instant,
 }
 
-/// What is known of an actor.
+/// Evidence that an actor works.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Standing {
-    /// No life of it has ever served.
+enum ActorStanding {
+    /// No incarnation of it has done useful work yet.
     Unknown,
-    /// It can do its work: some life of it has.
+    /// At least one incarnation of it has worked.
     Proven,
 }
 
-/// Why an actor is not started again for the time being.
+/// Reason why an actor is not restarted for now.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum GivenUp {
-    /// It found no learner: another life would find none either.
+    /// It found no learner, and another incarnation would not find one either.
     LearnerGone,
     /// It failed too often.
     KeepsDying(String),
@@ -86,34 +88,36 @@ pub(super) enum GivenUp {
 impl fmt::Display for GivenUp {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::LearnerGone => f.write_str("the last heard nothing of the learner"),
+            Self::LearnerGone => f.write_str("the last one found no learner"),
             Self::KeepsDying(how) => f.write_str(how),
         }
     }
 }
 
-/// What becomes of an actor that failed.
+/// Treatment of actors that fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AfterDeath {
-    /// It is started again, within limits.
+    /// They restart, within limits.
     Restart,
-    /// Nothing: the run is over.
+    /// They stay dead: the run is over.
     LetGo,
 }
 
 impl<'a> Crew<'a> {
-    /// A crew of `actors`, none of them started yet. Their ends will come as [`Event`]s, numbered as in `actors`.
+    /// Creates a crew of `actors`, all still to be started. Their ends arrive as
+    /// [`SupervisorEvent`]s, numbered as in `actors`.
     pub(super) fn new(
         run: &'a RunDirectory,
         program: &'a Path,
         actors: &[ActorId],
-        events: mpsc::Sender<Event>,
+        events: mpsc::Sender<SupervisorEvent>,
+        memory: MemoryWatch,
     ) -> Self {
         let member = |&id| Member {
             id,
-            state: State::Stranded,
+            state: ActorState::Stranded,
             deaths: ActorDeaths::default(),
-            standing: Standing::Unknown,
+            standing: ActorStanding::Unknown,
             work_before: None,
         };
         Self {
@@ -126,24 +130,26 @@ impl<'a> Crew<'a> {
             last_failure: None,
             restarts: 0,
             warnings: VecDeque::new(),
+            memory,
         }
     }
 
-    /// Starts a process for each actor that waits for a learner: all of them the first time, later those that left or were given up.
+    /// Starts a process for each actor that waits for a learner: at first all, later those that
+    /// left or were given up.
     ///
     /// # Errors
-    /// When one cannot be started; the others are told to end at once.
+    /// Returns an error if one cannot be started; the others are killed.
     pub(super) fn start(&mut self) -> Result<(), SupervisorError> {
         if self.after_death == AfterDeath::LetGo {
             return Ok(());
         }
         for number in 0..self.members.len() {
-            if !matches!(self.members[number].state, State::Stranded) {
+            if !matches!(self.members[number].state, ActorState::Stranded) {
                 continue;
             }
             self.members[number].deaths = ActorDeaths::default();
             if let Err(source) = self.start_member(number) {
-                self.order(Order::Kill);
+                self.order(ProcessOrder::Kill);
                 return Err(SupervisorError::Start {
                     program: self.program.to_owned(),
                     source,
@@ -156,7 +162,7 @@ impl<'a> Crew<'a> {
 
     fn start_member(&mut self, number: usize) -> io::Result<()> {
         let member = &mut self.members[number];
-        let launch = Launch {
+        let launch = ProcessLaunch {
             program: self.program,
             arguments: vec![
                 "--run".into(),
@@ -169,9 +175,9 @@ impl<'a> Crew<'a> {
             output: Output::Logged,
         };
         let child = launch.start()?;
-        let (orders, receiver) = watch::channel(Order::Run);
+        let (orders, receiver) = watch::channel(ProcessOrder::Run);
         let now = Instant::now();
-        member.state = State::Flying(Process {
+        member.state = ActorState::Flying(ActorProcess {
             orders,
             started: now,
             heard_of: now,
@@ -180,33 +186,37 @@ impl<'a> Crew<'a> {
         let events = self.events.clone();
         tokio::spawn(async move {
             let exit = reap(child, receiver).await;
-            // Nobody listens only when the supervisor itself has ended.
-            let _ = events.send(Event::ActorExited(number, exit)).await;
+            // Sending fails only when the supervisor itself has ended.
+            let _ = events
+                .send(SupervisorEvent::ActorExited(number, exit))
+                .await;
         });
         Ok(())
     }
 
-    /// Takes note of a report of the learner: it has done `work`, and counts `live` among its actors. An actor whose process lives but of which the
-    /// learner has heard nothing for `patience` is frozen or hangs: it is killed, and then started again as any that died.
-    pub(super) fn reported(&mut self, work: Work, live: &[u32], patience: Duration) {
+    /// Records a report of the learner: the run has done `work`, and `live` are its actors. An
+    /// actor whose process is alive but of which the learner has not heard for `patience` is
+    /// frozen; it is killed and then restarted like any that died.
+    pub(super) fn reported(&mut self, work: WorkDone, live: &[u32], patience: Duration) {
         let now = Instant::now();
         let is_first = self.work.replace(work).is_none();
         for member in &mut self.members {
-            let State::Flying(process) = &mut member.state else {
+            let ActorState::Flying(process) = &mut member.state else {
                 continue;
             };
-            // A learner that has just come has had no time to hear of anybody.
+            // A learner that has just started has had no time to hear of any actor.
             if live.contains(&member.id.0) {
                 process.heard_of = now;
-                member.standing = Standing::Proven;
+                member.standing = ActorStanding::Proven;
             } else if is_first {
                 process.heard_of = now;
             } else if now.duration_since(process.heard_of) > patience {
-                // Told again only if even that has no effect.
+                // Restarts the wait, so that the kill is repeated only if it has no effect.
                 process.heard_of = now;
-                process.orders.send_replace(Order::Kill);
+                process.orders.send_replace(ProcessOrder::Kill);
                 self.warnings.push_back(format!(
-                    "actor {} is there, but the learner has not heard of it for {} s: it is killed",
+                    "the learner has not heard of actor {} for {} s although its process is \
+                     alive: killing it",
                     member.id,
                     patience.as_secs()
                 ));
@@ -214,55 +224,71 @@ impl<'a> Crew<'a> {
         }
     }
 
-    /// Takes note that the learner is dead: until the next one reports, nothing that happens to an actor is held against it.
+    /// Records that the learner is dead. Until the next one reports, failures of an actor do not
+    /// count against it.
     pub(super) fn learner_died(&mut self) {
         self.work = None;
     }
 
-    /// Takes note that an actor ended. One that failed will be started again after a pause, unless it fails too often or the run is over.
+    /// Records that an actor ended. One that failed restarts after a pause, unless it fails too
+    /// often or the run is over.
     pub(super) fn exited(&mut self, number: usize, exit: &Exit) {
         let (work, learner_reports) = (self.work, self.work.is_some());
         let member = &mut self.members[number];
-        let (age, told) = match std::mem::replace(&mut member.state, State::Gone) {
-            State::Flying(process) => (process.started.elapsed(), *process.orders.borrow()),
-            State::Resting | State::Stranded | State::Gone => (Duration::ZERO, Order::Run),
+        let (age, last_order) = match std::mem::replace(&mut member.state, ActorState::Gone) {
+            ActorState::Flying(process) => (process.started.elapsed(), *process.orders.borrow()),
+            ActorState::Resting | ActorState::Stranded | ActorState::Gone => {
+                (Duration::ZERO, ProcessOrder::Run)
+            }
         };
         if self.after_death == AfterDeath::LetGo {
             return;
         }
         if *exit == Exit::SUCCESS {
-            // The learner said that the run is over. Should it die before it is, the next one needs actors again.
-            member.state = State::Stranded;
+            // The learner announced the end of the run. If it dies before that end, its next
+            // incarnation needs actors again.
+            member.state = ActorState::Stranded;
             return;
         }
-        if exit.is_for_want_of_a_learner() && !learner_reports {
-            member.state = State::Stranded;
+        if exit.found_no_learner() && !learner_reports {
+            member.state = ActorState::Stranded;
             self.last_failure = Some(GivenUp::LearnerGone);
             self.warnings
-                .push_back(format!("actor {} heard nothing of the learner and left", member.id));
+                .push_back(format!("actor {} found no learner and left", member.id));
             return;
         }
         if age >= GOOD_START {
-            member.standing = Standing::Proven;
+            member.standing = ActorStanding::Proven;
         }
-        let want = want_of_memory(exit, free_shared_memory());
-        let life = match member.judge(work) {
-            // Unless it was the supervisor, which kills only what no longer moves.
-            Life::InVain if want.is_some() || exit.is_a_kill() && told == Order::Run => Life::Interrupted,
-            life => life,
+        let shortage = self.memory.shortage(exit);
+        let is_excused = match &shortage {
+            Some(MemoryShortage::Shared(_)) => true,
+            // The next incarnation needs as much memory.
+            Some(MemoryShortage::Own(_)) => false,
+            None => exit.was_killed() && last_order == ProcessOrder::Run,
         };
-        match member.deaths.died(Instant::now(), life) {
-            Verdict::RestartAfter(pause) => self.rest(number, &format!("{exit}{}", want.unwrap_or_default()), pause),
-            Verdict::GiveUp => self.give_up(number, exit),
+        let incarnation = match member.judge(work) {
+            // A signal excuses the actor unless the supervisor sent it: it kills only frozen
+            // processes.
+            IncarnationUse::Useless if is_excused => IncarnationUse::Interrupted,
+            incarnation => incarnation,
+        };
+        let how = format!(
+            "{exit}{}",
+            shortage.as_ref().map_or("", MemoryShortage::text)
+        );
+        match member.deaths.died(Instant::now(), incarnation) {
+            RestartDecision::RestartAfter(pause) => self.rest(number, &how, pause),
+            RestartDecision::GiveUp => self.give_up(number, &how),
         }
     }
 
-    /// Has a member started again after `pause`.
+    /// Schedules the restart of a member after `pause`.
     fn rest(&mut self, number: usize, how: &str, pause: Duration) {
         let member = &mut self.members[number];
-        member.state = State::Resting;
+        member.state = ActorState::Resting;
         self.warnings.push_back(format!(
-            "actor {} {how}; it is started again in {} s ({})",
+            "actor {} {how}; restarting it in {} s (log: {})",
             member.id,
             pause.as_secs_f64(),
             self.run.actor_log(member.id).display()
@@ -270,18 +296,19 @@ impl<'a> Crew<'a> {
         let events = self.events.clone();
         tokio::spawn(async move {
             sleep(pause).await;
-            let _ = events.send(Event::ActorDue(number)).await;
+            let _ = events.send(SupervisorEvent::ActorDue(number)).await;
         });
     }
 
-    fn give_up(&mut self, number: usize, exit: &Exit) {
+    fn give_up(&mut self, number: usize, how: &str) {
         let member = &mut self.members[number];
-        member.state = State::Stranded;
+        member.state = ActorState::Stranded;
         let log = self.run.actor_log(member.id);
         let failure = format!(
-            "actor {} died {} times without having been of use, the last time it {exit}, and is given up; its log {} ends with\n{}",
+            "gave up on actor {}: it died {} times without doing useful work, the last time it \
+             {how}; its log {} ends with\n{}",
             member.id,
-            ActorDeaths::MAX_IN_VAIN,
+            ActorDeaths::MAX_USELESS,
             log.display(),
             log_tail(&log)
         );
@@ -289,67 +316,70 @@ impl<'a> Crew<'a> {
         self.warnings.push_back(failure);
     }
 
-    /// Starts an actor again whose pause is over.
+    /// Restarts an actor whose pause is over.
     pub(super) fn restart(&mut self, number: usize) {
-        if !matches!(self.members[number].state, State::Resting) {
+        if !matches!(self.members[number].state, ActorState::Resting) {
             return;
         }
         self.restarts += 1;
         if let Err(error) = self.start_member(number) {
-            self.exited(number, &Exit::Unknown(format!("could not be started: {error}")));
+            self.exited(
+                number,
+                &Exit::Unknown(format!("could not be started: {error}")),
+            );
         }
     }
 
-    /// Tells all actors to end. None is started again.
-    pub(super) fn order(&mut self, order: Order) {
+    /// Sends `order` to all actors. None is restarted afterwards.
+    pub(super) fn order(&mut self, order: ProcessOrder) {
         self.let_go();
         for member in &self.members {
-            if let State::Flying(process) = &member.state {
+            if let ActorState::Flying(process) = &member.state {
                 process.orders.send_replace(order);
             }
         }
     }
 
-    /// Starts none again from now on.
+    /// Stops restarting actors.
     pub(super) fn let_go(&mut self) {
         self.after_death = AfterDeath::LetGo;
         for member in &mut self.members {
-            if !matches!(member.state, State::Flying(_)) {
-                member.state = State::Gone;
+            if !matches!(member.state, ActorState::Flying(_)) {
+                member.state = ActorState::Gone;
             }
         }
     }
 
-    /// Whether a process is alive or will be again by itself.
+    /// Returns `true` while some actor's process is alive or waits for its restart.
     pub(super) fn is_alive(&self) -> bool {
         self.members
             .iter()
-            .any(|member| matches!(member.state, State::Flying(_) | State::Resting))
+            .any(|member| matches!(member.state, ActorState::Flying(_) | ActorState::Resting))
     }
 
-    /// Why the last actor that was given up was; `None` if none was.
+    /// Returns the reason of the last actor that was given up; `None` if none was.
     pub(super) fn last_failure(&self) -> Option<&GivenUp> {
         self.last_failure.as_ref()
     }
 
-    /// How often an actor was started again.
+    /// Number of restarts of actors.
     pub(super) fn restarts(&self) -> u64 {
         self.restarts
     }
 
-    /// The next thing to tell the user.
+    /// Returns the next warning for the user.
     pub(super) fn next_warning(&mut self) -> Option<String> {
         self.warnings.pop_front()
     }
 }
 
 impl Member {
-    /// What a life of this member was good for that ended when the run had done `work`.
-    fn judge(&self, work: Option<Work>) -> Life {
+    /// Judges an incarnation of this member that ended when the run had done `work`.
+    fn judge(&self, work: Option<WorkDone>) -> IncarnationUse {
         match (work, self.standing) {
-            (None, Standing::Proven) => Life::Interrupted,
-            (Some(_), Standing::Proven) if self.work_before != work => Life::Served,
-            _ => Life::InVain,
+            (None, ActorStanding::Proven) => IncarnationUse::Interrupted,
+            (Some(_), ActorStanding::Proven) if self.work_before != work => IncarnationUse::Served,
+            _ => IncarnationUse::Useless,
         }
     }
 }

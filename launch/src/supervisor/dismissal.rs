@@ -1,4 +1,4 @@
-//! How actors are seen off when their run is over.
+//! Ends the actors of a run that is over.
 
 use std::pin::pin;
 use std::time::Duration;
@@ -6,24 +6,27 @@ use std::time::Duration;
 use tokio::sync::mpsc;
 use tokio::time::sleep;
 
-use super::Event;
+use super::SupervisorEvent;
 use super::crew::Crew;
-use super::process::Order;
+use super::process::ProcessOrder;
 
-/// How long actors may take to follow the learner's word that the run is over.
+/// Time in which actors must react to the learner's announcement that the run is over.
 pub(super) const ACTOR_GRACE: Duration = Duration::from_secs(5);
-/// How long actors may take to follow SIGTERM.
+/// Time in which actors must react to SIGTERM.
 const TERMINATE_GRACE: Duration = Duration::from_secs(5);
 
-/// Sees to it that no actor is left: those that do not end by themselves are told, those that do not listen are killed. An interruption skips the
-/// waiting.
+/// Waits until no actor is left. Actors that do not end by themselves get SIGTERM, then SIGKILL. An
+/// interruption skips the waiting.
 pub(super) async fn dismiss(
     crew: &mut Crew<'_>,
-    inbox: &mut mpsc::Receiver<Event>,
+    inbox: &mut mpsc::Receiver<SupervisorEvent>,
     interrupts: &mut mpsc::Receiver<()>,
 ) {
     crew.let_go();
-    for (grace, next) in [(ACTOR_GRACE, Order::Terminate), (TERMINATE_GRACE, Order::Kill)] {
+    for (grace, next) in [
+        (ACTOR_GRACE, ProcessOrder::Terminate),
+        (TERMINATE_GRACE, ProcessOrder::Kill),
+    ] {
         let mut expired = pin!(sleep(grace));
         while crew.is_alive() {
             tokio::select! {
@@ -42,8 +45,8 @@ pub(super) async fn dismiss(
     }
 }
 
-fn note_exit(crew: &mut Crew<'_>, event: Event) {
-    if let Event::ActorExited(number, exit) = event {
+fn note_exit(crew: &mut Crew<'_>, event: SupervisorEvent) {
+    if let SupervisorEvent::ActorExited(number, exit) = event {
         crew.exited(number, &exit);
     }
 }

@@ -1,92 +1,98 @@
-//! The learner of a run, through all its lives.
+//! Learner of a run, across all its incarnations.
 
 use std::time::Duration;
 
-use skein_protocol::failure::EXIT_START_AGAIN;
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
+use skein_run::failure::EXIT_RESTART;
 use tokio::io::{AsyncBufReadExt, BufReader, Lines};
 use tokio::process::ChildStdout;
 use tokio::sync::{mpsc, watch};
 use tokio::time::{Instant, sleep, timeout};
 
-use super::log_tail::{last_words, log_tail};
-use super::memory::want_of_memory;
-use super::process::{Exit, Launch, Order, Output, reap};
-use super::restarts::{Cause, LearnerDeaths, Verdict};
-use super::work::Work;
-use super::{Event, Plan, SupervisorError};
-use crate::prepare::room::free_shared_memory;
+use super::memory::{MemoryShortage, MemoryWatch};
+use super::process::{Exit, Output, ProcessLaunch, ProcessOrder, reap};
+use super::restarts::{DeathCause, LearnerDeaths, RestartDecision};
+use super::work::WorkDone;
+use super::{SupervisionPlan, SupervisorError, SupervisorEvent};
+use skein_run::log_tail::{last_words, log_tail};
 
-/// Last words come before the end; a pipe that somebody else holds open must not delay that for ever.
+/// Time to wait for the last output of a learner that ended. Another process may hold its pipe
+/// open, which must not block for ever.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
-/// The learner of a run.
-pub(super) struct Learner<'a> {
-    plan: &'a Plan,
-    events: mpsc::Sender<Event>,
-    state: State,
+/// Learner of a run.
+pub(super) struct LearnerProcess<'a> {
+    plan: &'a SupervisionPlan,
+    events: mpsc::Sender<SupervisorEvent>,
+    state: LearnerState,
     deaths: LearnerDeaths,
     restarts: u64,
+    memory: MemoryWatch,
 }
 
-enum State {
+enum LearnerState {
     /// A process is alive and has not reported yet.
     Starting {
-        orders: watch::Sender<Order>,
+        orders: watch::Sender<ProcessOrder>,
         since: Instant,
     },
-    /// It reports.
+    /// It has reported.
     Reporting {
-        orders: watch::Sender<Order>,
+        orders: watch::Sender<ProcessOrder>,
         heard: Instant,
-        work: Work,
+        work: WorkDone,
     },
-    /// It is as good as dead.
+    /// It was killed, and its end has not arrived yet.
     Killed,
-    /// There is none.
+    /// No process exists.
     Dead,
 }
 
-/// What a report shows beyond its figures.
+/// Change that a report shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum News {
-    /// The learner is up: it is this life's first report.
+    /// The first report of this incarnation: the learner is up.
     Up,
-    /// More has been done since the last one.
+    /// More work is done than in the last report.
     GetsOn,
-    /// Nothing.
+    /// No change.
     Nothing,
 }
 
-impl<'a> Learner<'a> {
-    /// Starts the learner of `plan`. What it says and its end will come as [`Event`]s.
+impl<'a> LearnerProcess<'a> {
+    /// Starts the learner of `plan`. Its output and its end arrive as [`SupervisorEvent`]s.
     ///
     /// # Errors
     /// [`SupervisorError::Start`].
-    pub(super) fn start(plan: &'a Plan, events: mpsc::Sender<Event>) -> Result<Self, SupervisorError> {
+    pub(super) fn start(
+        plan: &'a SupervisionPlan,
+        events: mpsc::Sender<SupervisorEvent>,
+        memory: MemoryWatch,
+    ) -> Result<Self, SupervisorError> {
         let mut learner = Self {
             plan,
             events,
-            state: State::Dead,
+            state: LearnerState::Dead,
             deaths: LearnerDeaths::new(plan.deadlines.learner_pause),
             restarts: 0,
+            memory,
         };
         learner.launch()?;
         Ok(learner)
     }
 
-    /// Starts it again. A start that fails counts as a death.
+    /// Restarts it. A failed start counts as a death.
     pub(super) fn start_again(&mut self) {
         self.restarts += 1;
         if let Err(error) = self.launch() {
             let events = self.events.clone();
             let exit = Exit::Unknown(error.to_string());
-            tokio::spawn(async move { events.send(Event::LearnerExited(exit)).await });
+            tokio::spawn(async move { events.send(SupervisorEvent::LearnerExited(exit)).await });
         }
     }
 
     fn launch(&mut self) -> Result<(), SupervisorError> {
-        let launch = Launch {
+        let launch = ProcessLaunch {
             program: &self.plan.programs.learner,
             arguments: vec!["--run".into(), self.plan.run.root().into()],
             threads: self.plan.learner_threads,
@@ -97,172 +103,193 @@ impl<'a> Learner<'a> {
             program: self.plan.programs.learner.clone(),
             source,
         })?;
-        let said = child
-            .stdout
-            .take()
-            .map(|output| tokio::spawn(listen(BufReader::new(output).lines(), self.events.clone())));
-        let (orders, receiver) = watch::channel(Order::Run);
+        let said = child.stdout.take().map(|output| {
+            tokio::spawn(listen(BufReader::new(output).lines(), self.events.clone()))
+        });
+        let (orders, receiver) = watch::channel(ProcessOrder::Run);
         let events = self.events.clone();
         tokio::spawn(async move {
             let exit = reap(child, receiver).await;
             if let Some(mut said) = said {
                 let _ = timeout(LAST_WORDS, &mut said).await;
-                // Nothing of this life may be taken for a word of the next.
+                // Output of this incarnation must not be attributed to the next.
                 said.abort();
             }
-            let _ = events.send(Event::LearnerExited(exit)).await;
+            let _ = events.send(SupervisorEvent::LearnerExited(exit)).await;
         });
-        self.state = State::Starting {
+        self.state = LearnerState::Starting {
             orders,
             since: Instant::now(),
         };
         Ok(())
     }
 
-    /// Takes note of a report.
-    pub(super) fn reported(&mut self, progress: &Progress) -> News {
-        let (heard, done) = (Instant::now(), Work::of(progress));
+    /// Records a report.
+    pub(super) fn reported(&mut self, progress: &ProgressReport) -> News {
+        let (heard, done) = (Instant::now(), WorkDone::of(progress));
         self.deaths.reached(done);
-        match std::mem::replace(&mut self.state, State::Dead) {
-            State::Starting { orders, .. } => {
-                self.state = State::Reporting {
+        match std::mem::replace(&mut self.state, LearnerState::Dead) {
+            LearnerState::Starting { orders, .. } => {
+                self.state = LearnerState::Reporting {
                     orders,
                     heard,
                     work: done,
                 };
                 News::Up
             }
-            State::Reporting { orders, work, .. } => {
-                self.state = State::Reporting {
+            LearnerState::Reporting { orders, work, .. } => {
+                self.state = LearnerState::Reporting {
                     orders,
                     heard,
                     work: done,
                 };
-                if done == work { News::Nothing } else { News::GetsOn }
+                if done == work {
+                    News::Nothing
+                } else {
+                    News::GetsOn
+                }
             }
-            state @ (State::Killed | State::Dead) => {
+            state @ (LearnerState::Killed | LearnerState::Dead) => {
                 self.state = state;
                 News::Nothing
             }
         }
     }
 
-    /// When it will have been silent for too long.
+    /// Returns the time at which its silence becomes too long.
     pub(super) fn deadline(&self) -> Option<Instant> {
         let deadlines = &self.plan.deadlines;
         match self.state {
-            State::Starting { since, .. } => Some(since + deadlines.learner_start),
-            State::Reporting { heard, .. } => Some(heard + deadlines.learner_silence),
-            State::Killed | State::Dead => None,
+            LearnerState::Starting { since, .. } => Some(since + deadlines.learner_start),
+            LearnerState::Reporting { heard, .. } => Some(heard + deadlines.learner_silence),
+            LearnerState::Killed | LearnerState::Dead => None,
         }
     }
 
-    /// Lets its silence begin now: it was the supervisor that did not listen.
+    /// Restarts the wait for a report: the supervisor itself was held up and did not listen.
     pub(super) fn forgive_silence(&mut self) {
         let now = Instant::now();
         match &mut self.state {
-            State::Starting { since, .. } => *since = now,
-            State::Reporting { heard, .. } => *heard = now,
-            State::Killed | State::Dead => {}
+            LearnerState::Starting { since, .. } => *since = now,
+            LearnerState::Reporting { heard, .. } => *heard = now,
+            LearnerState::Killed | LearnerState::Dead => {}
         }
     }
 
-    /// Tells it something, if it is there.
-    pub(super) fn order(&mut self, order: Order) {
-        if let State::Starting { orders, .. } | State::Reporting { orders, .. } = &self.state {
+    /// Sends it `order`, if its process is alive.
+    pub(super) fn order(&mut self, order: ProcessOrder) {
+        if let LearnerState::Starting { orders, .. } | LearnerState::Reporting { orders, .. } =
+            &self.state
+        {
             orders.send_replace(order);
         }
     }
 
     /// Kills it.
     pub(super) fn kill(&mut self) {
-        self.order(Order::Kill);
+        self.order(ProcessOrder::Kill);
         if !self.is_dead() {
-            self.state = State::Killed;
+            self.state = LearnerState::Killed;
         }
     }
 
-    /// Whether there is no process.
+    /// Returns `true` if no process exists.
     pub(super) fn is_dead(&self) -> bool {
-        matches!(self.state, State::Dead)
+        matches!(self.state, LearnerState::Dead)
     }
 
-    /// Whether a process is there and has reported.
+    /// Returns `true` if its process is alive and has reported.
     pub(super) fn is_reporting(&self) -> bool {
-        matches!(self.state, State::Reporting { .. })
+        matches!(self.state, LearnerState::Reporting { .. })
     }
 
-    /// How often it was started again.
+    /// Number of its restarts.
     pub(super) fn restarts(&self) -> u64 {
         self.restarts
     }
 
-    /// Takes note of its end, and has it started again if that may help: [`Event::LearnerDue`] will say when. Returns what the user is told.
+    /// Records its end. If a restart may help, schedules [`SupervisorEvent::LearnerDue`] and
+    /// returns a message for the user.
     ///
     /// # Errors
-    /// Why it is not started again.
+    /// Returns the reason why it is not restarted.
     pub(super) fn exited(&mut self, exit: &Exit) -> Result<String, SupervisorError> {
-        let state = std::mem::replace(&mut self.state, State::Dead);
-        if !exit.may_pass() {
+        let state = std::mem::replace(&mut self.state, LearnerState::Dead);
+        if self.is_directory_gone() {
+            return Err(self.failed(exit.to_string()));
+        }
+        if !exit.may_recover() {
             return Err(
                 match last_words(&self.plan.run.learner_log(), &self.plan.programs.learner) {
-                    Some(words) if matches!(state, State::Starting { .. }) => {
+                    Some(words) if matches!(state, LearnerState::Starting { .. }) => {
                         SupervisorError::LearnerCannotStart(words)
                     }
                     _ => self.failed(exit.to_string()),
                 },
             );
         }
-        // The supervisor kills only what no longer moves: that counts as a failure.
-        let want = want_of_memory(exit, free_shared_memory());
-        let cause = if want.is_some() || exit.is_a_kill() && !matches!(state, State::Killed) {
-            Cause::Outside
-        } else {
-            Cause::Failure
+        // The supervisor kills only a frozen learner, so that counts as a failure.
+        let shortage = self.memory.shortage(exit);
+        let killed_from_outside = exit.was_killed() && !matches!(state, LearnerState::Killed);
+        let cause = match &shortage {
+            // The next incarnation needs as much memory.
+            Some(MemoryShortage::Own(_)) => DeathCause::Failure,
+            Some(MemoryShortage::Shared(_)) => DeathCause::Outside,
+            None if killed_from_outside => DeathCause::Outside,
+            None => DeathCause::Failure,
         };
+        let shortage = shortage.as_ref().map_or("", MemoryShortage::text);
         match self.deaths.died(cause) {
-            Verdict::GiveUp => Err(self.failed(format!(
-                "died {} times without getting any further, the last time it {exit}",
+            RestartDecision::GiveUp => Err(self.failed(format!(
+                "died {} times without making progress, the last time it {exit}{shortage}",
                 LearnerDeaths::MAX_WITHOUT_PROGRESS
             ))),
-            Verdict::RestartAfter(pause) => {
+            RestartDecision::RestartAfter(pause) => {
                 let events = self.events.clone();
                 tokio::spawn(async move {
                     sleep(pause).await;
-                    let _ = events.send(Event::LearnerDue).await;
+                    let _ = events.send(SupervisorEvent::LearnerDue).await;
                 });
                 let when = match pause {
-                    Duration::ZERO => "at once".to_owned(),
+                    Duration::ZERO => "now".to_owned(),
                     pause => format!("in {} s", pause.as_secs()),
                 };
                 Ok(format!(
-                    "the learner {exit}{}{}; it is started again {when}, {}",
+                    "the learner {exit}{}{shortage}; restarting it {when}, {}",
                     self.reason_given(exit),
-                    want.unwrap_or_default(),
-                    self.whence()
+                    self.restart_point()
                 ))
             }
         }
     }
 
-    /// What a learner that asks for another life says about it.
+    /// Returns the reason given by a learner that asks for a restart.
     fn reason_given(&self, exit: &Exit) -> String {
-        (*exit == Exit::Status(EXIT_START_AGAIN.into()))
+        (*exit == Exit::Status(EXIT_RESTART.into()))
             .then(|| last_words(&self.plan.run.learner_log(), &self.plan.programs.learner))
             .flatten()
             .map_or(String::new(), |words| format!(" (\"{words}\")"))
     }
 
-    /// What its next life begins from.
-    fn whence(&self) -> &'static str {
+    /// Returns the point from which its next incarnation continues.
+    fn restart_point(&self) -> &'static str {
         match self.plan.run.newest_checkpoint() {
             Some(_) => "from its newest checkpoint",
             None => "from the beginning: there is no checkpoint yet",
         }
     }
 
-    /// That it ended, of which `how` tells.
+    /// Returns `true` if the run's directory was removed or moved. A learner that was about to save
+    /// may have created part of it again.
+    pub(super) fn is_directory_gone(&self) -> bool {
+        !self.plan.run.logs().is_dir()
+    }
+
+    /// Returns the error for its end, described by `how`.
     pub(super) fn failed(&self, how: String) -> SupervisorError {
+        if self.is_directory_gone() {
+            return SupervisorError::DirectoryGone(self.plan.run.root().to_owned());
+        }
         let log = self.plan.run.learner_log();
         SupervisorError::LearnerFailed {
             how,
@@ -272,9 +299,13 @@ impl<'a> Learner<'a> {
     }
 }
 
-async fn listen(mut lines: Lines<BufReader<ChildStdout>>, events: mpsc::Sender<Event>) {
+async fn listen(mut lines: Lines<BufReader<ChildStdout>>, events: mpsc::Sender<SupervisorEvent>) {
     while let Ok(Some(line)) = lines.next_line().await {
-        if events.send(Event::LearnerSaid(line)).await.is_err() {
+        if events
+            .send(SupervisorEvent::LearnerSaid(line))
+            .await
+            .is_err()
+        {
             return;
         }
     }

@@ -1,21 +1,23 @@
 //! Starts, watches, restarts, stops and reaps the processes of a run.
 //!
-//! The learner comes first, and the actors once it has reported for the first time: what keeps it from starting is then told once, and nobody waits for
-//! a learner that will not come. Whoever dies is started again; a learner goes on from its newest checkpoint, and the actors, who stay alive, find it by
-//! themselves. Whoever is alive but gives no sign of it is killed first.
+//! The learner starts first; the actors start once it has reported for the first time. An error
+//! that keeps the learner from starting is therefore printed once, and no actor waits for a learner
+//! that does not come. A process that dies is restarted: a learner resumes from its newest
+//! checkpoint, and the actors stay alive and find it again by themselves. A process that is alive
+//! but silent is killed first.
 //!
-//! The order of a stop matters: the learner is told first, because it abandons the flights in the air, saves what was learned and tells the actors
-//! itself; only actors that are still there afterwards are ended from here. Every wait has a deadline, so that a stop always comes to an end, and
-//! every way out of this module leaves no process behind.
+//! The order of a stop matters. The learner is stopped first, because it abandons the episodes in
+//! the air, saves its state and notifies the actors itself; only actors that still run afterwards
+//! are ended from here. Every wait has a deadline, so a stop always completes. Every way out of
+//! this module leaves no process behind.
 //!
-//! Who may interrupt, and what is done with the progress, is the caller's: see [`Watcher`].
+//! The caller decides who may interrupt and where progress is shown: see [`Watcher`].
 
 mod attached;
 mod crew;
 mod dismissal;
 mod error;
 mod learner;
-pub(crate) mod log_tail;
 mod memory;
 mod process;
 mod restarts;
@@ -30,8 +32,8 @@ use std::time::Duration;
 
 use skein_protocol::config::Config;
 use skein_protocol::ids::ActorId;
-use skein_protocol::progress::Progress;
-use skein_protocol::run::RunDirectory;
+use skein_protocol::progress::ProgressReport;
+use skein_run::RunDirectory;
 
 use process::Exit;
 
@@ -39,23 +41,23 @@ pub use attached::attach;
 pub use error::SupervisorError;
 pub use supervision::run;
 
-/// Events that wait at most; a child that says more waits itself.
+/// Capacity of the event queue; a child that prints more waits.
 const EVENTS: usize = 64;
 
-/// The programs that a run consists of.
+/// Programs of a run.
 #[derive(Debug, Clone)]
 pub struct Programs {
-    /// Takes `--run DIR`; writes [`Progress`] as JSON lines on its standard output.
+    /// Takes `--run DIR`; writes [`ProgressReport`] as JSON lines on its standard output.
     pub learner: PathBuf,
     /// Takes `--run DIR --id K`.
     pub actor: PathBuf,
 }
 
 impl Programs {
-    /// Those that lie beside the running program.
+    /// Returns the programs that lie beside the running program.
     ///
     /// # Errors
-    /// [`SupervisorError::Missing`] names what is not there.
+    /// [`SupervisorError::Missing`] names the missing file.
     pub fn beside_this() -> Result<Self, SupervisorError> {
         let this = std::env::current_exe().map_err(SupervisorError::Setup)?;
         let beside = |name: &str| {
@@ -73,94 +75,100 @@ impl Programs {
     }
 }
 
-/// A run to be supervised.
+/// A run to supervise.
 #[derive(Debug, Clone)]
-pub struct Plan {
-    /// Its directory, created; an absolute path.
+pub struct SupervisionPlan {
+    /// Run directory: it exists, and its path is absolute.
     pub run: RunDirectory,
-    /// What is started.
+    /// Programs to start.
     pub programs: Programs,
-    /// The actors to start, their ids claimed.
+    /// Actors to start; their ids are claimed.
     pub actors: Vec<ActorId>,
-    /// Threads of the learner's tensor operations.
+    /// Threads for the learner's tensor operations.
     pub learner_threads: usize,
-    /// How long is waited for what.
+    /// Limits of all waits.
     pub deadlines: Deadlines,
 }
 
-/// How long is waited for what.
+/// Limits of the supervisor's waits.
 #[derive(Debug, Clone)]
 pub struct Deadlines {
-    /// From the learner's start to its first report: it loads its libraries and a checkpoint.
+    /// From the learner's start to its first report. It loads its libraries and a checkpoint
+    /// meanwhile.
     pub learner_start: Duration,
-    /// Between two reports of the learner, of which it makes two a second from a thread that does nothing else. A learner that is silent for longer is
-    /// frozen.
+    /// Between two reports of the learner. A dedicated thread reports twice a second, so a learner
+    /// that is silent for longer is frozen.
     pub learner_silence: Duration,
-    /// Before a learner is started again that has died twice without getting any further. It is started at once the first time; later pauses double, up to
-    /// eight times this one.
+    /// Pause before the restart of a learner that has died twice without progress. The first
+    /// restart is immediate; later pauses double, up to eight times this one.
     pub learner_pause: Duration,
-    /// How long the learner may show no progress once it is told to stop: it finishes what it is about, which shows, and saves, which does not.
+    /// Time without progress that a stopping learner is allowed. Finishing its work shows as
+    /// progress; saving does not.
     pub learner_stop: Duration,
-    /// How long the learner may have heard nothing of an actor whose process is alive.
+    /// Time for which the learner may not have heard of an actor whose process is alive.
     pub actor_silence: Duration,
 }
 
 impl Deadlines {
-    /// Those for a run with `config`.
+    /// Returns the limits for a run with `config`.
     pub fn of(config: &Config) -> Self {
         Self {
-            // An overburdened machine may take so long; and killing what only is slow helps nobody.
+            // An overloaded machine may need this long, and killing a slow learner does not help.
             learner_start: Duration::from_secs(120),
-            // Actors wait for transport.learner_silence_secs and then leave: the rest of that time is for the next life to begin in.
+            // Actors leave after transport.learner_silence_secs. The rest of that time is left for
+            // the next incarnation to start.
             learner_silence: Duration::from_secs_f64(
                 (config.transport.learner_silence_secs * 2.0 / 3.0).clamp(5.0, 60.0),
             ),
-            // Eight seconds at the most, well below what actors wait.
+            // Pauses reach eight seconds at most, well below the time that actors wait.
             learner_pause: Duration::from_secs(1),
             learner_stop: Duration::from_secs(90),
-            // Six times what makes the learner give its tickets to others, and enough to start in.
-            actor_silence: Duration::from_secs_f64((config.transport.actor_silence_secs * 6.0).max(30.0)),
+            // Six times the silence after which the learner reissues tickets, and enough time to
+            // start.
+            actor_silence: Duration::from_secs_f64(
+                (config.transport.actor_silence_secs * 6.0).max(30.0),
+            ),
         }
     }
 }
 
-/// How supervision ended, when nothing failed.
+/// End of a supervision without failure.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ended {
-    /// The run came to its end.
+    /// The run completed.
     Finished,
     /// The user stopped it.
     Interrupted,
 }
 
-/// How often processes were started again.
+/// Number of process restarts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Restarts {
-    /// The learner.
+    /// Restarts of the learner.
     pub learner: u64,
-    /// Actors, all together.
+    /// Restarts of all actors together.
     pub actors: u64,
 }
 
-/// Who looks on while a run is supervised.
+/// Observer of a supervised run.
 pub trait Watcher {
-    /// The learner reported.
-    fn progress(&mut self, progress: &Progress, restarts: Restarts);
-    /// Something the user should know.
+    /// Handles a report of the learner.
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts);
+    /// Handles a warning for the user.
     fn warn(&mut self, text: &str);
 }
 
-/// What happens to a supervisor.
+/// SupervisorEvent that a supervisor handles.
 #[derive(Debug)]
-enum Event {
+enum SupervisorEvent {
     /// The learner printed a line.
     LearnerSaid(String),
     /// The learner ended.
     LearnerExited(Exit),
-    /// The pause of the learner is over.
+    /// The pause before the learner's restart is over.
     LearnerDue,
-    /// The actor of this number ended.
+    /// The actor with this number ended.
     ActorExited(usize, Exit),
-    /// The pause of the actor of this number is over.
+    /// The pause before this actor's restart is over.
     ActorDue(usize),
 }

@@ -1,4 +1,4 @@
-//! One child process: how it is started, told to end, and reaped.
+//! One child process: how it is started, signalled and reaped.
 
 use std::ffi::OsString;
 use std::fmt;
@@ -9,19 +9,20 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_protocol::failure::{EXIT_LEARNER_GONE, EXIT_START_AGAIN};
+use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_RESTART};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
-use crate::orphans::signal_when_orphaned;
+use skein_run::orphans::signal_when_orphaned;
+use skein_run::signals::heed;
 
-/// Status of a Rust program that panicked.
+/// Exit status of a Rust program that panicked.
 const PANICKED: i32 = 101;
 
-/// What a process is told.
+/// Instruction to a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Order {
-    /// Go on.
+pub(super) enum ProcessOrder {
+    /// Keep running.
     Run,
     /// SIGTERM: end in order.
     Terminate,
@@ -29,19 +30,19 @@ pub(super) enum Order {
     Kill,
 }
 
-/// How a process ended. Shown as what is said of it: "exited with status 1".
+/// End of a process. Its text completes a sentence: "exited with status 1".
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Exit {
-    /// By itself, with this status.
+    /// It ended by itself, with this status.
     Status(i32),
-    /// By this signal.
+    /// It was killed by this signal.
     Signal(i32),
-    /// It could not be started again, or not be waited for.
+    /// It could not be restarted, or not be waited for.
     Unknown(String),
 }
 
 impl Exit {
-    /// The status of success.
+    /// Exit status of success.
     pub(super) const SUCCESS: Self = Self::Status(0);
 
     fn of(status: io::Result<ExitStatus>) -> Self {
@@ -55,23 +56,24 @@ impl Exit {
         }
     }
 
-    /// Whether it ended because it found no learner.
-    pub(super) fn is_for_want_of_a_learner(&self) -> bool {
+    /// Returns `true` if it ended because it found no learner.
+    pub(super) fn found_no_learner(&self) -> bool {
         *self == Self::Status(EXIT_LEARNER_GONE.into())
     }
 
-    /// Whether somebody ended it by a signal for that purpose. Whether that was the supervisor itself does not show here.
-    pub(super) fn is_a_kill(&self) -> bool {
+    /// Returns `true` if a signal killed it. The value does not show whether the supervisor sent
+    /// that signal.
+    pub(super) fn was_killed(&self) -> bool {
         [Signal::KILL, Signal::TERM]
             .iter()
             .any(|signal| *self == Self::Signal(signal.as_raw()))
     }
 
-    /// Whether the same program may do better when it is started again: it was killed, it panicked, or its transport failed. An error that it
-    /// told itself would come again.
-    pub(super) fn may_pass(&self) -> bool {
+    /// Returns `true` if a restart may help: it was killed, it panicked, or its transport failed.
+    /// An error that the program reported itself would only repeat.
+    pub(super) fn may_recover(&self) -> bool {
         match *self {
-            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_START_AGAIN),
+            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_RESTART),
             Self::Signal(_) | Self::Unknown(_) => true,
         }
     }
@@ -88,36 +90,39 @@ impl fmt::Display for Exit {
     }
 }
 
-/// Where a process writes its standard output.
+/// Destination of a process's standard output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Output {
-    /// To the supervisor.
+    /// A pipe to the supervisor.
     Piped,
-    /// Into its log file, as its standard error always does.
+    /// Its log file, like its standard error.
     Logged,
 }
 
-/// A program to start: which, with what arguments, and where its output goes.
+/// A program to start, with its arguments and the destination of its output.
 #[derive(Debug)]
-pub(super) struct Launch<'a> {
+pub(super) struct ProcessLaunch<'a> {
     pub(super) program: &'a Path,
     pub(super) arguments: Vec<OsString>,
-    /// Threads its tensor libraries may use; more than its share would slow everybody down.
+    /// Threads for its tensor libraries. More than its share would slow all processes down.
     pub(super) threads: usize,
     pub(super) log: PathBuf,
     pub(super) output: Output,
 }
 
-impl Launch<'_> {
+impl ProcessLaunch<'_> {
     /// Starts the program.
     ///
-    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the supervisor, which knows the order of things. The
-    /// kernel kills it when the *thread* that started it ends, however that comes about: to be called on the main thread.
-    ///
+    /// It leads a process group of its own, so that Ctrl-C in the terminal reaches only the
+    /// supervisor, which stops processes in the right order. The kernel kills it when the *thread*
+    /// that started it ends, for whatever reason: call this on the main thread.
     /// # Errors
-    /// When its log cannot be opened or the program cannot be started.
+    /// Returns an error if its log cannot be opened or the program cannot be started.
     pub(super) fn start(&self) -> io::Result<Child> {
-        let log = OpenOptions::new().create(true).append(true).open(&self.log)?;
+        let log = OpenOptions::new()
+            .create(true)
+            .append(true)
+            .open(&self.log)?;
         let output = match self.output {
             Output::Piped => Stdio::piped(),
             Output::Logged => log.try_clone()?.into(),
@@ -128,7 +133,7 @@ impl Launch<'_> {
             .env("OMP_NUM_THREADS", self.threads.to_string())
             .env("MKL_NUM_THREADS", self.threads.to_string())
             .env("OMP_DYNAMIC", "false")
-            // A waiting thread gives its core to an actor instead of spinning on it.
+            // A waiting thread yields its core to an actor instead of spinning.
             .env("OMP_WAIT_POLICY", "passive")
             .env("GOMP_SPINCOUNT", "0")
             .stdin(Stdio::null())
@@ -137,33 +142,39 @@ impl Launch<'_> {
             .process_group(0)
             .kill_on_drop(true);
         signal_when_orphaned(command.as_std_mut(), Signal::KILL);
+        heed(command.as_std_mut(), Signal::TERM);
         command.spawn()
     }
 }
 
-/// Waits for `child`, passing on what `orders` say. Returns only when it is reaped: nothing is left of it then.
-pub(super) async fn reap(mut child: Child, mut orders: watch::Receiver<Order>) -> Exit {
+/// Waits for `child` and forwards `orders` to it. Returns once it is reaped and nothing is left of
+/// it.
+pub(super) async fn reap(mut child: Child, mut orders: watch::Receiver<ProcessOrder>) -> Exit {
     let mut listening = true;
     loop {
         tokio::select! {
             status = child.wait() => return Exit::of(status),
             changed = orders.changed(), if listening => {
                 listening = changed.is_ok();
-                // Whoever gave the orders is gone without an order: nobody wants the process any more.
-                let order = if listening { *orders.borrow_and_update() } else { Order::Kill };
+                // The sender is gone without a last order: the process is no longer needed.
+                let order = match listening {
+                    true => *orders.borrow_and_update(),
+                    false => ProcessOrder::Kill,
+                };
                 obey(&child, order);
             }
         }
     }
 }
 
-fn obey(child: &Child, order: Order) {
+fn obey(child: &Child, order: ProcessOrder) {
     let signal = match order {
-        Order::Run => return,
-        Order::Terminate => Signal::TERM,
-        Order::Kill => Signal::KILL,
+        ProcessOrder::Run => return,
+        ProcessOrder::Terminate => Signal::TERM,
+        ProcessOrder::Kill => Signal::KILL,
     };
-    // A child that is not reaped keeps its number, so the signal cannot reach a stranger; and that it has just ended is no error.
+    // A child that is not reaped keeps its process id, so the signal cannot reach another process.
+    // A child that has just ended is not an error.
     if let Some(pid) = child.id().and_then(|id| Pid::from_raw(id.cast_signed())) {
         let _ = kill_process(pid, signal);
     }

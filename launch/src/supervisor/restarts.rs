@@ -1,95 +1,101 @@
-//! When a process that died is started again, and when it is given up.
+//! Decides when a process that died is restarted, and when it is given up.
 //!
-//! Being killed gives nobody up: processes may be killed as often as anybody likes, and are only started again after longer pauses. What counts is
-//! whether those that fail by themselves get anywhere in between.
+//! Kills from outside never lead to giving up: a process may be killed any number of times, and
+//! only the pauses grow. What counts is whether processes that fail by themselves make progress in
+//! between.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::work::Work;
+use super::work::WorkDone;
 
-/// What follows a death.
+/// Decision after a death.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
-    /// Start it again after this pause.
+pub(super) enum RestartDecision {
+    /// Restart it after this pause.
     RestartAfter(Duration),
     /// Leave it dead.
     GiveUp,
 }
 
-/// The deaths of an actor.
+/// Deaths of an actor.
 #[derive(Debug, Default)]
 pub(super) struct ActorDeaths {
     recent: VecDeque<Instant>,
-    in_vain: usize,
+    useless: usize,
 }
 
 impl ActorDeaths {
-    /// Lives in vain, one after the other, after which an actor is given up: what kills it will kill it again.
-    pub(super) const MAX_IN_VAIN: usize = 5;
+    /// Number of consecutive useless incarnations after which an actor is given up: the same cause
+    /// would kill it again.
+    pub(super) const MAX_USELESS: usize = 5;
     /// Deaths longer ago than this no longer lengthen the pause.
     const WINDOW: Duration = Duration::from_secs(60);
-    /// Pause before the first restart; it doubles with each further death within the window, up to the longest.
+    /// Pause before the first restart. It doubles with each further death within the window, up to
+    /// the longest.
     const FIRST_PAUSE: Duration = Duration::from_millis(250);
     const LONGEST_PAUSE: Duration = Duration::from_secs(8);
 
-    /// Notes a death at `now` and decides what follows.
-    pub(super) fn died(&mut self, now: Instant, life: Life) -> Verdict {
-        self.recent.retain(|&death| now.duration_since(death) < Self::WINDOW);
+    /// Records a death at `now` and returns the decision.
+    pub(super) fn died(&mut self, now: Instant, incarnation: IncarnationUse) -> RestartDecision {
+        self.recent
+            .retain(|&death| now.duration_since(death) < Self::WINDOW);
         self.recent.push_back(now);
-        self.in_vain = match life {
-            Life::Served => 0,
-            Life::Interrupted => self.in_vain,
-            Life::InVain => self.in_vain + 1,
+        self.useless = match incarnation {
+            IncarnationUse::Served => 0,
+            IncarnationUse::Interrupted => self.useless,
+            IncarnationUse::Useless => self.useless + 1,
         };
-        if self.in_vain >= Self::MAX_IN_VAIN {
-            return Verdict::GiveUp;
+        if self.useless >= Self::MAX_USELESS {
+            return RestartDecision::GiveUp;
         }
         let doublings = u32::try_from(self.recent.len() - 1).unwrap_or(u32::MAX);
         let pause = Self::FIRST_PAUSE.saturating_mul(2_u32.saturating_pow(doublings));
-        Verdict::RestartAfter(pause.min(Self::LONGEST_PAUSE))
+        RestartDecision::RestartAfter(pause.min(Self::LONGEST_PAUSE))
     }
 }
 
-/// What an actor's life was good for.
+/// Usefulness of an actor's incarnation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Life {
-    /// The learner heard of it, and the run got on meanwhile.
+pub(super) enum IncarnationUse {
+    /// The learner heard of it, and the run progressed meanwhile.
     Served,
-    /// There was no learner to serve, or somebody killed it: that says nothing about the actor.
+    /// No learner was there to serve, or it was killed from outside: inconclusive.
     Interrupted,
-    /// Neither.
-    InVain,
+    /// Neither of these.
+    Useless,
 }
 
-/// Whose doing a death of the learner was.
+/// Origin of the learner's death.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Cause {
-    /// Somebody else's: it says nothing about the learner.
+pub(super) enum DeathCause {
+    /// An outside cause, which proves nothing about the learner.
     Outside,
-    /// Its own.
+    /// The learner's own failure.
     Failure,
 }
 
-/// The deaths of the learner.
+/// Deaths of the learner.
 #[derive(Debug)]
 pub(super) struct LearnerDeaths {
     first_pause: Duration,
-    furthest: Option<Work>,
+    furthest: Option<WorkDone>,
     since_progress: u32,
     failures_since_progress: u32,
 }
 
 impl LearnerDeaths {
-    /// Failures after which the run fails, if none of these lives got further than one before it. Not fewer, because a learner that dies before it has
-    /// written a checkpoint may get no further by no fault of its own.
+    /// Number of failures after which the run fails, if none of these incarnations made progress.
+    /// The number is large because a learner that dies before it writes a checkpoint may make no
+    /// progress through no fault of its own.
     pub(super) const MAX_WITHOUT_PROGRESS: u32 = 10;
-    /// The longest pause, in first pauses.
+    /// Longest pause, in multiples of the first.
     const LONGEST_PAUSE: u32 = 8;
 
-    /// No deaths so far. There is no pause after the first, `first_pause` after the second, then they double.
+    /// Creates the state before any death. The first death has no pause, the second `first_pause`;
+    /// then pauses double.
     pub(super) fn new(first_pause: Duration) -> Self {
         Self {
             first_pause,
@@ -99,10 +105,11 @@ impl LearnerDeaths {
         }
     }
 
-    /// Notes how far the run has come. Only what no life before has reached is progress: the rest is done over.
-    pub(super) fn reached(&mut self, work: Work) {
+    /// Records the work done. Only work beyond that of all earlier incarnations is progress; the
+    /// rest is repeated.
+    pub(super) fn reached(&mut self, work: WorkDone) {
         if self.furthest.is_none_or(|furthest| work > furthest) {
-            // The first report of all shows where the run began, not that it gets on.
+            // The very first report shows where the run began, not progress.
             if self.furthest.is_some() {
                 self.since_progress = 0;
                 self.failures_since_progress = 0;
@@ -111,20 +118,20 @@ impl LearnerDeaths {
         }
     }
 
-    /// Notes a death and decides what follows.
-    pub(super) fn died(&mut self, cause: Cause) -> Verdict {
+    /// Records a death and returns the decision.
+    pub(super) fn died(&mut self, cause: DeathCause) -> RestartDecision {
         self.since_progress = self.since_progress.saturating_add(1);
-        if cause == Cause::Failure {
+        if cause == DeathCause::Failure {
             self.failures_since_progress += 1;
         }
         if self.failures_since_progress >= Self::MAX_WITHOUT_PROGRESS {
-            return Verdict::GiveUp;
+            return RestartDecision::GiveUp;
         }
         match self.since_progress {
-            1 => Verdict::RestartAfter(Duration::ZERO),
+            1 => RestartDecision::RestartAfter(Duration::ZERO),
             deaths => {
                 let pauses = 2_u32.saturating_pow(deaths - 2).min(Self::LONGEST_PAUSE);
-                Verdict::RestartAfter(self.first_pause * pauses)
+                RestartDecision::RestartAfter(self.first_pause * pauses)
             }
         }
     }
@@ -138,73 +145,98 @@ mod tests {
     fn pauses_double_until_the_actor_is_given_up() {
         let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         let verdicts: Vec<_> = (0..5)
-            .map(|second| deaths.died(start + Duration::from_secs(second), Life::InVain))
+            .map(|second| deaths.died(start + Duration::from_secs(second), IncarnationUse::Useless))
             .collect();
-        let pause = |factor| Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE * factor);
-        assert_eq!(verdicts, [pause(1), pause(2), pause(4), pause(8), Verdict::GiveUp]);
+        let pause = |factor| RestartDecision::RestartAfter(ActorDeaths::FIRST_PAUSE * factor);
+        assert_eq!(
+            verdicts,
+            [
+                pause(1),
+                pause(2),
+                pause(4),
+                pause(8),
+                RestartDecision::GiveUp
+            ]
+        );
     }
 
     #[test]
-    fn an_actor_that_serves_between_its_deaths_is_started_again_for_ever() {
+    fn an_actor_that_is_useful_between_deaths_is_always_restarted() {
         let (mut deaths, start) = (ActorDeaths::default(), Instant::now());
         for second in 0..1000 {
-            let life = if second % 4 == 0 { Life::Served } else { Life::InVain };
-            let verdict = deaths.died(start + Duration::from_secs(second), life);
-            assert_ne!(verdict, Verdict::GiveUp);
+            let incarnation = if second % 4 == 0 {
+                IncarnationUse::Served
+            } else {
+                IncarnationUse::Useless
+            };
+            let verdict = deaths.died(start + Duration::from_secs(second), incarnation);
+            assert_ne!(verdict, RestartDecision::GiveUp);
         }
-        let verdict = deaths.died(start + Duration::from_secs(1000), Life::Served);
-        assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::LONGEST_PAUSE));
-        let verdict = deaths.died(start + Duration::from_secs(1061), Life::Served);
-        assert_eq!(verdict, Verdict::RestartAfter(ActorDeaths::FIRST_PAUSE));
+        let verdict = deaths.died(start + Duration::from_secs(1000), IncarnationUse::Served);
+        assert_eq!(
+            verdict,
+            RestartDecision::RestartAfter(ActorDeaths::LONGEST_PAUSE)
+        );
+        let verdict = deaths.died(start + Duration::from_secs(1061), IncarnationUse::Served);
+        assert_eq!(
+            verdict,
+            RestartDecision::RestartAfter(ActorDeaths::FIRST_PAUSE)
+        );
     }
 
     #[test]
-    fn an_actor_is_not_blamed_for_a_learner_that_is_not_there() {
+    fn an_actor_is_not_blamed_for_an_absent_learner() {
         let (mut deaths, now) = (ActorDeaths::default(), Instant::now());
         for _ in 0..100 {
-            assert_ne!(deaths.died(now, Life::Interrupted), Verdict::GiveUp);
+            assert_ne!(
+                deaths.died(now, IncarnationUse::Interrupted),
+                RestartDecision::GiveUp
+            );
         }
     }
 
     #[test]
-    fn a_learner_is_started_again_at_once_and_then_after_pauses() {
+    fn a_learner_restarts_at_once_and_later_after_pauses() {
         let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
-        let secs: Vec<_> = std::iter::from_fn(|| match deaths.died(Cause::Failure) {
-            Verdict::RestartAfter(pause) => Some(pause.as_secs()),
-            Verdict::GiveUp => None,
+        let secs: Vec<_> = std::iter::from_fn(|| match deaths.died(DeathCause::Failure) {
+            RestartDecision::RestartAfter(pause) => Some(pause.as_secs()),
+            RestartDecision::GiveUp => None,
         })
         .collect();
         assert_eq!(secs, [0, 1, 2, 4, 8, 8, 8, 8, 8]);
     }
 
     #[test]
-    fn a_learner_that_is_killed_is_started_again_for_ever() {
+    fn a_learner_killed_from_outside_is_always_restarted() {
         let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
         for _ in 0..1000 {
-            assert_ne!(deaths.died(Cause::Outside), Verdict::GiveUp);
+            assert_ne!(deaths.died(DeathCause::Outside), RestartDecision::GiveUp);
         }
         assert_eq!(
-            deaths.died(Cause::Outside),
-            Verdict::RestartAfter(Duration::from_secs(8))
+            deaths.died(DeathCause::Outside),
+            RestartDecision::RestartAfter(Duration::from_secs(8))
         );
     }
 
     #[test]
-    fn only_what_no_life_before_reached_is_progress() {
+    fn only_work_beyond_all_earlier_incarnations_is_progress() {
         let mut deaths = LearnerDeaths::new(Duration::from_secs(1));
-        deaths.reached(Work::test(0));
-        for life in 0..1000 {
-            deaths.reached(Work::test(life));
-            deaths.reached(Work::test(life + 1));
-            assert_eq!(deaths.died(Cause::Failure), Verdict::RestartAfter(Duration::ZERO));
+        deaths.reached(WorkDone::test(0));
+        for incarnation in 0..1000 {
+            deaths.reached(WorkDone::test(incarnation));
+            deaths.reached(WorkDone::test(incarnation + 1));
+            assert_eq!(
+                deaths.died(DeathCause::Failure),
+                RestartDecision::RestartAfter(Duration::ZERO)
+            );
         }
-        // It dies at the same place again and again, having done the same work each time.
+        // Dies at the same place repeatedly, after the same work each time.
         let again: Vec<_> = (0..LearnerDeaths::MAX_WITHOUT_PROGRESS - 1)
             .map(|_| {
-                (990..=1000).for_each(|updates| deaths.reached(Work::test(updates)));
-                deaths.died(Cause::Failure)
+                (990..=1000).for_each(|updates| deaths.reached(WorkDone::test(updates)));
+                deaths.died(DeathCause::Failure)
             })
             .collect();
-        assert_eq!(again.last(), Some(&Verdict::GiveUp));
+        assert_eq!(again.last(), Some(&RestartDecision::GiveUp));
     }
 }

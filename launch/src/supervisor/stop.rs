@@ -1,14 +1,14 @@
-//! How far a stop has come.
+//! Progress of a stop.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// How far a stop has come.
+/// Progress of a stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Stop {
     NotYet,
-    /// The learner is told; it is killed at the deadline.
+    /// The learner is stopping; it is killed at the deadline.
     InOrder {
         deadline: Instant,
     },
@@ -25,7 +25,7 @@ impl Stop {
         }
     }
 
-    /// A learner that still gets somewhere is not killed.
+    /// Extends the deadline: a learner that still makes progress is not killed.
     pub(super) fn progressed(self, grace: Duration) -> Self {
         match self {
             Self::InOrder { .. } => Self::InOrder {

@@ -1,39 +1,49 @@
-//! A learner and its actors, supervised from the first start to the last exit.
+//! Supervises a learner and its actors from the first start to the last exit.
 
 use std::ops::ControlFlow::{self, Break, Continue};
 use std::time::Duration;
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep_until};
 
 use super::crew::Crew;
 use super::dismissal::dismiss;
-use super::learner::{Learner, News};
-use super::process::{Exit, Order};
+use super::learner::{LearnerProcess, News};
+use super::memory::MemoryWatch;
+use super::process::{Exit, ProcessOrder};
 use super::stop::Stop;
-use super::work::Work;
-use super::{EVENTS, Ended, Event, Plan, Restarts, SupervisorError, Watcher};
+use super::work::WorkDone;
+use super::{EVENTS, Ended, Restarts, SupervisionPlan, SupervisorError, SupervisorEvent, Watcher};
 
-/// Waking so much later than asked for, the supervisor itself was held up, and what it did not hear in that time proves nothing.
+/// If the supervisor wakes later than planned by this much, it was itself held up, and silence of
+/// other processes during that time proves nothing.
 const HELD_UP: Duration = Duration::from_secs(1);
 
-/// Supervises a learner and its actors until the run ends. Each message on `interrupts` is one interruption by the user: the first stops in order,
-/// the second at once.
+/// Supervises a learner and its actors until the run ends. Each message on `interrupts` is an
+/// interruption by the user: the first stops in order, the second immediately.
 ///
 /// # Errors
-/// [`SupervisorError`] names the program, its log and the log's last lines. No process is left in any case.
+/// [`SupervisorError`] names the program, its log and the log's last lines. No process is left in
+/// any case.
 pub async fn run(
-    plan: &Plan,
+    plan: &SupervisionPlan,
     interrupts: &mut mpsc::Receiver<()>,
     watcher: &mut impl Watcher,
 ) -> Result<Ended, SupervisorError> {
     let (events, mut inbox) = mpsc::channel(EVENTS);
+    let memory = MemoryWatch::new();
     let mut supervision = Supervision {
         plan,
         watcher,
-        learner: Learner::start(plan, events.clone())?,
-        crew: Crew::new(&plan.run, &plan.programs.actor, &plan.actors, events),
+        learner: LearnerProcess::start(plan, events.clone(), memory.clone())?,
+        crew: Crew::new(
+            &plan.run,
+            &plan.programs.actor,
+            &plan.actors,
+            events,
+            memory,
+        ),
         stop: Stop::NotYet,
         failure: None,
         stall: Stall::None,
@@ -41,19 +51,19 @@ pub async fn run(
     loop {
         let deadline = supervision.deadline();
         let flow = tokio::select! {
-            Some(event) = inbox.recv() => supervision.heed(event),
+            Some(event) = inbox.recv() => supervision.handle(event),
             Some(()) = interrupts.recv() => supervision.interrupted(),
             () = sleep_until(deadline.unwrap_or_else(Instant::now)), if deadline.is_some() => {
                 supervision.deadline_passed();
                 Continue(())
             }
         };
-        supervision.look_after_crew();
+        supervision.check_crew();
         if flow.is_break() {
             break;
         }
     }
-    // The learner is gone, and so should be the actors.
+    // The learner has ended; now the actors must end.
     let Supervision {
         mut crew,
         stop,
@@ -61,7 +71,7 @@ pub async fn run(
         ..
     } = supervision;
     if failure.is_some() {
-        crew.order(Order::Terminate);
+        crew.order(ProcessOrder::Terminate);
     }
     dismiss(&mut crew, &mut inbox, interrupts).await;
     match failure {
@@ -72,41 +82,41 @@ pub async fn run(
 }
 
 struct Supervision<'a, W> {
-    plan: &'a Plan,
+    plan: &'a SupervisionPlan,
     watcher: &'a mut W,
-    learner: Learner<'a>,
+    learner: LearnerProcess<'a>,
     crew: Crew<'a>,
     stop: Stop,
     failure: Option<SupervisorError>,
     stall: Stall,
 }
 
-/// Whether the learner says that nothing moves, and the user knows.
+/// Stall of the learner, and whether the user knows of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stall {
     None,
-    Told,
+    Reported,
 }
 
 impl<W: Watcher> Supervision<'_, W> {
-    /// Takes note of what happened; breaks when the learner is gone for good.
-    fn heed(&mut self, event: Event) -> ControlFlow<()> {
+    /// Handles an event; breaks when the learner has ended for good.
+    fn handle(&mut self, event: SupervisorEvent) -> ControlFlow<()> {
         match event {
-            Event::LearnerSaid(line) => match serde_json::from_str(&line) {
+            SupervisorEvent::LearnerSaid(line) => match serde_json::from_str(&line) {
                 Ok(progress) => self.reported(&progress),
-                // Somebody meant it to be read.
+                // Not a report: text for the user.
                 Err(_) => self.watcher.warn(&line),
             },
-            Event::LearnerExited(exit) => return self.learner_exited(&exit),
-            Event::LearnerDue if self.stop == Stop::NotYet => self.learner.start_again(),
-            Event::LearnerDue => {}
-            Event::ActorExited(number, exit) => self.crew.exited(number, &exit),
-            Event::ActorDue(number) => self.crew.restart(number),
+            SupervisorEvent::LearnerExited(exit) => return self.learner_exited(&exit),
+            SupervisorEvent::LearnerDue if self.stop == Stop::NotYet => self.learner.start_again(),
+            SupervisorEvent::LearnerDue => {}
+            SupervisorEvent::ActorExited(number, exit) => self.crew.exited(number, &exit),
+            SupervisorEvent::ActorDue(number) => self.crew.restart(number),
         }
         Continue(())
     }
 
-    fn reported(&mut self, progress: &Progress) {
+    fn reported(&mut self, progress: &ProgressReport) {
         let restarts = Restarts {
             learner: self.learner.restarts(),
             actors: self.crew.restarts(),
@@ -114,10 +124,10 @@ impl<W: Watcher> Supervision<'_, W> {
         self.watcher.progress(progress, restarts);
         match (&progress.stalled, self.stall) {
             (Some(stalled), Stall::None) => {
-                self.watcher.warn(&format!("nothing moves: {stalled}"));
-                self.stall = Stall::Told;
+                self.watcher.warn(&format!("no progress: {stalled}"));
+                self.stall = Stall::Reported;
             }
-            (None, Stall::Told) => self.stall = Stall::None,
+            (None, Stall::Reported) => self.stall = Stall::None,
             _ => {}
         }
         let news = self.learner.reported(progress);
@@ -128,7 +138,7 @@ impl<W: Watcher> Supervision<'_, W> {
             return;
         }
         self.crew.reported(
-            Work::of(progress),
+            WorkDone::of(progress),
             &progress.live_actors,
             self.plan.deadlines.actor_silence,
         );
@@ -142,14 +152,15 @@ impl<W: Watcher> Supervision<'_, W> {
         }
     }
 
-    /// Breaks unless there will be another life.
+    /// Breaks unless another incarnation will follow.
     fn learner_exited(&mut self, exit: &Exit) -> ControlFlow<()> {
         self.crew.learner_died();
         if *exit == Exit::SUCCESS || self.stop == Stop::AtOnce {
             return Break(());
         }
         if let Stop::InOrder { .. } = self.stop {
-            // One that had not even begun had nothing to save, and may have known nothing of signals yet.
+            // A learner that had not reported had nothing to save, and may not have installed its
+            // signal handlers yet.
             if self.learner.is_reporting() {
                 let how = exit.to_string();
                 self.failure.get_or_insert_with(|| self.learner.failed(how));
@@ -157,8 +168,8 @@ impl<W: Watcher> Supervision<'_, W> {
             return Break(());
         }
         match self.learner.exited(exit) {
-            Ok(told) => {
-                self.watcher.warn(&told);
+            Ok(message) => {
+                self.watcher.warn(&message);
                 Continue(())
             }
             Err(error) => {
@@ -168,7 +179,7 @@ impl<W: Watcher> Supervision<'_, W> {
         }
     }
 
-    /// Breaks when there is nobody to be waited for.
+    /// Breaks when no process is left to wait for.
     fn interrupted(&mut self) -> ControlFlow<()> {
         self.stop = self.stop.interrupted(self.plan.deadlines.learner_stop);
         if self.learner.is_dead() {
@@ -176,24 +187,32 @@ impl<W: Watcher> Supervision<'_, W> {
         }
         if self.stop == Stop::AtOnce {
             self.learner.kill();
-            self.crew.order(Order::Kill);
+            self.crew.order(ProcessOrder::Kill);
         } else {
             self.watcher.warn(
-                "stopping in order: finishing the updates of this epoch; Ctrl-C again stops at once, without saving",
+                "stopping: finishing the updates of this epoch, then saving; \
+                     press Ctrl-C again to stop immediately, without saving",
             );
-            self.learner.order(Order::Terminate);
+            self.learner.order(ProcessOrder::Terminate);
         }
         Continue(())
     }
 
-    /// When the learner will have done nothing for too long.
+    /// Returns the time at which the learner has been idle for too long.
     fn deadline(&self) -> Option<Instant> {
-        self.stop.deadline().into_iter().chain(self.learner.deadline()).min()
+        self.stop
+            .deadline()
+            .into_iter()
+            .chain(self.learner.deadline())
+            .min()
     }
 
-    /// Kills a learner that has done nothing for too long. Its end will say what follows.
+    /// Kills a learner that has been idle for too long. The event of its end decides what follows.
     fn deadline_passed(&mut self) {
-        if self.deadline().is_none_or(|deadline| deadline.elapsed() > HELD_UP) {
+        if self
+            .deadline()
+            .is_none_or(|deadline| deadline.elapsed() > HELD_UP)
+        {
             self.learner.forgive_silence();
             self.stop = self.stop.progressed(self.plan.deadlines.learner_stop);
             return;
@@ -206,19 +225,21 @@ impl<W: Watcher> Supervision<'_, W> {
                 deadlines.learner_start
             }
             .as_secs();
-            self.watcher
-                .warn(&format!("the learner has not reported for {secs} s: it is killed"));
+            self.watcher.warn(&format!(
+                "the learner has not reported for {secs} s: killing it"
+            ));
         } else {
-            self.watcher.warn("the learner does not stop: it is killed");
+            self.watcher.warn("the learner does not stop: killing it");
             self.stop = Stop::AtOnce;
-            self.failure
-                .get_or_insert_with(|| self.learner.failed("did not stop when it was told to".to_owned()));
+            self.failure.get_or_insert_with(|| {
+                self.learner.failed("did not stop when asked to".to_owned())
+            });
         }
         self.learner.kill();
     }
 
-    /// Tells what there is to tell of the actors, and stops the run when none is left.
-    fn look_after_crew(&mut self) {
+    /// Forwards warnings about the actors, and stops the run when no actor is left.
+    fn check_crew(&mut self) {
         while let Some(warning) = self.crew.next_warning() {
             self.watcher.warn(&warning);
         }
@@ -227,9 +248,12 @@ impl<W: Watcher> Supervision<'_, W> {
             && !self.crew.is_alive()
             && let Some(reason) = self.crew.last_failure()
         {
-            self.failure = Some(SupervisorError::NoActors(reason.to_string()));
+            self.failure = Some(match self.learner.is_directory_gone() {
+                true => SupervisorError::DirectoryGone(self.plan.run.root().to_owned()),
+                false => SupervisorError::NoActors(reason.to_string()),
+            });
             self.stop = self.stop.interrupted(self.plan.deadlines.learner_stop);
-            self.learner.order(Order::Terminate);
+            self.learner.order(ProcessOrder::Terminate);
         }
     }
 }

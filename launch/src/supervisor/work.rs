@@ -1,34 +1,35 @@
-//! What a run has done so far, as far as the learner's reports show it.
+//! Work done by a run, as shown by the learner's reports.
 
-use skein_protocol::progress::Progress;
+use skein_protocol::progress::ProgressReport;
 
-/// What a run has done so far. More work is greater: flights come first, then what is made of them.
+/// Work done by a run. More work compares greater: first by episodes, then by the updates made from
+/// them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Work {
-    flights: u64,
+pub(super) struct WorkDone {
+    episodes: u64,
     vae_updates: u64,
     updates: u64,
-    evaluation_flights: u64,
+    evaluation_episodes: u64,
 }
 
-impl Work {
-    pub(super) fn of(progress: &Progress) -> Self {
+impl WorkDone {
+    pub(super) fn of(progress: &ProgressReport) -> Self {
         Self {
-            flights: progress.flights,
+            episodes: progress.episodes,
             vae_updates: progress.vae_updates,
             updates: progress.updates,
-            evaluation_flights: progress.evaluation_flights.0,
+            evaluation_episodes: progress.evaluation_episodes.0,
         }
     }
 
-    /// So many updates, and nothing else.
+    /// Returns work of `updates` updates and nothing else.
     #[cfg(test)]
     pub(super) fn test(updates: u64) -> Self {
         Self {
-            flights: 0,
+            episodes: 0,
             vae_updates: 0,
             updates,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
         }
     }
 }

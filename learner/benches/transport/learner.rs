@@ -1,4 +1,4 @@
-//! The learner's side: reception as in a run, with a training thread that only takes flights out.
+//! The learner's side: receiver as in a run, with a training thread that only takes episodes out.
 
 use std::collections::VecDeque;
 use std::hint::black_box;
@@ -7,59 +7,59 @@ use std::sync::atomic::AtomicBool;
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
-use skein_learner::flight::CommittedFlight;
-use skein_learner::flights::assembly::Keep;
-use skein_learner::flights::reception::{Batch, Reception};
+use skein_learner::episode::CommittedEpisode;
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
-use skein_protocol::ids::{Attempt, Epoch, FlightId, PolicyVersion};
-use skein_protocol::run::{LearnerSeat, RunDirectory, RunIdentity};
+use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
+use skein_run::{LearnerLock, RunDirectory, RunIdentity};
 use tempfile::TempDir;
 
 use crate::SYNTHETIC_ACTOR;
 use crate::synthetic::STEPS;
 
-/// How long actors may take to come, and to leave.
+/// Longest time for actors to attach, and to leave.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Batches that are ordered ahead, so that nobody waits for orders.
+/// Batches ordered ahead, so that no actor waits for orders.
 const BATCHES_AHEAD: usize = 3;
 
-/// What the learner is put under.
+/// Settings of one measurement.
 pub(crate) struct Load {
-    pub(crate) keep: Keep,
+    pub(crate) keep: KeptData,
     pub(crate) warm_up: Duration,
     pub(crate) measured: Duration,
 }
 
-/// What came of it.
+/// Results of one measurement.
 pub(crate) struct Throughput {
-    /// Records of flights that were taken out of their batches, whole and in order.
+    /// Rate of records in episodes that were taken out of their batches, whole and in order.
     pub(crate) records_per_second: f64,
-    /// Processor time of the receiving thread.
+    /// Processor time per record of the receiving thread.
     pub(crate) thread_micros: f64,
-    /// Processor time of all of the learner.
+    /// Processor time per record of the whole learner.
     pub(crate) process_micros: f64,
     /// Time to copy a record's bytes in this process.
     pub(crate) copy_micros: f64,
 }
 
-/// A learner, its actors, and the flights it has ordered.
+/// A learner, its actors, and the episodes it has ordered.
 pub(crate) struct Learner {
     identity: RunIdentity,
     directory: RunDirectory,
-    reception: Reception,
+    receiver: EpisodeReceiver,
     actors: Vec<Child>,
-    batches: VecDeque<Batch>,
-    next_flight: u64,
-    // Last, for the others lie in it.
-    _seat: LearnerSeat,
+    batches: VecDeque<EpisodeBatch>,
+    next_episode: u64,
+    // Last, because the others use it.
+    _lock: LearnerLock,
     _folder: TempDir,
 }
 
 impl Learner {
-    /// A learner of a run of its own, without actors.
+    /// Starts a learner with a new run, without actors.
     pub(crate) fn start() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
@@ -68,20 +68,20 @@ impl Learner {
         config.sac.hidden_width = 8;
         directory.create(&config).unwrap();
         let (identity, config) = directory.open().unwrap();
-        let seat = LearnerSeat::take(&directory, &identity).unwrap();
+        let lock = LearnerLock::take(&directory, &identity).unwrap();
         Self {
-            reception: Reception::start(&identity, seat.life(), &config).unwrap(),
+            receiver: EpisodeReceiver::start(&identity, lock.incarnation(), &config).unwrap(),
             identity,
             directory,
             actors: Vec::new(),
             batches: VecDeque::new(),
-            next_flight: 0,
-            _seat: seat,
+            next_episode: 0,
+            _lock: lock,
             _folder: folder,
         }
     }
 
-    /// Starts synthetic actors until there are so many.
+    /// Starts synthetic actors until there are `count`.
     pub(crate) fn start_actors(&mut self, count: u32) {
         for number in self.actors.len()..count as usize {
             let actor = Command::new(std::env::current_exe().unwrap())
@@ -95,28 +95,34 @@ impl Learner {
             self.actors.push(actor);
         }
         let deadline = Instant::now() + PATIENCE;
-        while self.reception.shared().live_actors().len() < self.actors.len() {
-            assert!(Instant::now() < deadline, "not all of {count} actors have come");
+        while self.receiver.state().live_actors().len() < self.actors.len() {
+            assert!(
+                Instant::now() < deadline,
+                "not all of {count} actors have come"
+            );
             sleep(Duration::from_millis(5));
         }
     }
 
-    /// What the learner's part in `load` costs.
+    /// Measures the learner's costs under `load`.
     pub(crate) fn throughput(&mut self, load: &Load) -> Throughput {
         let copy_micros = copy_micros(load.measured / 4);
-        self.take_flights(load.keep, load.warm_up);
+        self.take_episodes(load.keep, load.warm_up);
         let cpu = || {
             let threads = cpu_secs();
-            (threads["reception"], threads.values().sum::<f64>())
+            (threads["receiver"], threads.values().sum::<f64>())
         };
         let (began, (thread_before, process_before)) = (Instant::now(), cpu());
-        let records = self.take_flights(load.keep, load.measured) as f64;
+        let records = self.take_episodes(load.keep, load.measured) as f64;
         let (took, (thread_after, process_after)) = (began.elapsed(), cpu());
         self.take_rest();
 
-        let faults = self.reception.shared().faults();
+        let faults = self.receiver.state().faults();
         assert!(
-            faults.reissued_by_reason().values().all(|&count| count == 0),
+            faults
+                .reissued_by_reason()
+                .values()
+                .all(|&count| count == 0),
             "{faults:?}"
         );
         assert!(
@@ -132,14 +138,14 @@ impl Learner {
         }
     }
 
-    /// Sends the actors home, and ends.
+    /// Tells the actors to leave, and ends.
     pub(crate) fn finish(mut self) {
-        self.reception.finish();
+        self.receiver.finish();
         await_ends(&mut self.actors);
     }
 
-    /// Orders flights and takes them out for so long; returns the number of their records.
-    fn take_flights(&mut self, keep: Keep, time: Duration) -> usize {
+    /// Orders episodes and takes them out for `time`; returns the number of their records.
+    fn take_episodes(&mut self, keep: KeptData, time: Duration) -> usize {
         let end = Instant::now() + time;
         let mut records = 0;
         while Instant::now() < end {
@@ -147,56 +153,56 @@ impl Learner {
                 self.order(keep);
             }
             match self.batches[0].next(&AtomicBool::new(false)).unwrap() {
-                Some(flight) => records += look_at(&flight, keep),
+                Some(episode) => records += look_at(&episode, keep),
                 None => drop(self.batches.pop_front()),
             }
         }
         records
     }
 
-    /// Takes out what is ordered.
+    /// Takes out what is still ordered.
     fn take_rest(&mut self) {
         for mut batch in self.batches.drain(..) {
             while batch.next(&AtomicBool::new(false)).unwrap().is_some() {}
         }
     }
 
-    fn order(&mut self, keep: Keep) {
-        let flights = (4 * self.actors.len() as u64).max(16);
-        let numbers = self.next_flight..self.next_flight + flights;
-        let ticket = |flight| Ticket {
+    fn order(&mut self, keep: KeptData) {
+        let episodes = (4 * self.actors.len() as u64).max(16);
+        let numbers = self.next_episode..self.next_episode + episodes;
+        let ticket = |episode| Ticket {
             run: self.identity.run,
-            flight: FlightId(flight),
+            episode: EpisodeId(episode),
             attempt: Attempt(0),
             policy_version: PolicyVersion(0),
             course: CourseChoice::Training,
             start_level: 1,
             exploration: Exploration::Sample,
-            seed: flight,
-            leg: None,
+            seed: episode,
+            segment: None,
         };
         let tickets = numbers.clone().map(ticket).collect();
         self.batches
-            .push_back(self.reception.fly(Epoch(0), keep, tickets).unwrap());
-        self.next_flight = numbers.end;
+            .push_back(self.receiver.fly(Epoch(0), keep, tickets).unwrap());
+        self.next_episode = numbers.end;
     }
 }
 
-/// Makes sure that all of a flight is there; returns the number of its records.
-fn look_at(flight: &CommittedFlight, keep: Keep) -> usize {
-    flight.check().unwrap();
-    assert_eq!(flight.steps(), STEPS as usize);
-    assert_eq!(flight.depth.is_some(), keep == Keep::Depth);
-    if let Some(depth) = &flight.depth {
+/// Checks that an episode is complete; returns the number of its records.
+fn look_at(episode: &CommittedEpisode, keep: KeptData) -> usize {
+    episode.check().unwrap();
+    assert_eq!(episode.steps(), STEPS as usize);
+    assert_eq!(episode.depth.is_some(), keep == KeptData::Depth);
+    if let Some(depth) = &episode.depth {
         assert_eq!(
             (depth[0], depth[depth.len() - 1]),
-            (flight.actor.0 as u8, flight.actor.0 as u8)
+            (episode.actor.0 as u8, episode.actor.0 as u8)
         );
     }
-    flight.observations.len()
+    episode.observations.len()
 }
 
-/// Waits for the actors' ends; whoever does not end is killed.
+/// Waits for the actors to end; kills those that do not.
 fn await_ends(actors: &mut [Child]) {
     let deadline = Instant::now() + PATIENCE;
     for actor in actors {
@@ -211,17 +217,19 @@ fn await_ends(actors: &mut [Child]) {
     }
 }
 
-/// Time to copy a record out of memory as large as an actor's into a flight, as [`Keep::Depth`] asks for.
+/// Time to copy a record from memory as large as an actor's into an episode, as [`KeptData::Depth`]
+/// does.
 fn copy_micros(time: Duration) -> f64 {
     let record = size_of::<TransitionRecord>();
-    let (of_actor, of_flight) = (512, STEPS as usize + 1);
+    let (of_actor, of_episode) = (512, STEPS as usize + 1);
     let from = vec![7_u8; of_actor * record];
-    let mut into = vec![0_u8; of_flight * record];
+    let mut into = vec![0_u8; of_episode * record];
     let (began, mut copied) = (Instant::now(), 0_usize);
     while began.elapsed() < time {
-        for _ in 0..of_flight {
-            let (source, target) = (copied % of_actor * record, copied % of_flight * record);
-            into[target..target + record].copy_from_slice(black_box(&from[source..source + record]));
+        for _ in 0..of_episode {
+            let (source, target) = (copied % of_actor * record, copied % of_episode * record);
+            into[target..target + record]
+                .copy_from_slice(black_box(&from[source..source + record]));
             copied += 1;
         }
         black_box(&mut into);

@@ -1,4 +1,4 @@
-//! A synthetic actor: takes tickets and sends whole flights of valid records, without simulating.
+//! A synthetic actor: takes tickets and sends whole episodes of valid records, without simulating.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -6,39 +6,44 @@ use std::time::{Duration, Instant};
 
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::Config;
-use skein_protocol::ids::{ActorId, Incarnation, PolicyVersion};
-use skein_protocol::run::{Presence, RunDirectory};
-use skein_protocol::services::{ActorPorts, LoanedTransition};
-use skein_protocol::stages::Times;
+use skein_protocol::ids::{ActorId, ActorIncarnation, PolicyVersion};
+use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, Ticket};
 use skein_protocol::transition::{Outcome, RecordKind};
+use skein_run::{Presence, RunDirectory};
+use skein_transport::{ActorPorts, LoanedTransition};
 
-/// Steps of every flight: as many as from one end of the corridor to the other.
+/// Steps of every episode: as many as from one end of the corridor to the other.
 pub(crate) const STEPS: u32 = 120;
-/// How long to go on without a word of the learner.
+/// Time without a message from the learner after which the actor gives up.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-struct Actor {
+struct SyntheticActor {
     ports: ActorPorts,
     id: ActorId,
-    incarnation: Incarnation,
+    incarnation: ActorIncarnation,
     heartbeat: Duration,
     last_heard: Instant,
-    last_said: Instant,
+    last_report: Instant,
     tickets: VecDeque<Ticket>,
-    has_told_of_waiting: bool,
+    has_reported_waiting: bool,
     is_over: bool,
     /// Length of the latent codes.
     latent: usize,
     image: Box<[u8; IMAGE_PIXELS]>,
 }
 
-/// Serves the learner of the run in `directory` as actor number `id`, until the run is over or nothing is heard of the learner.
+/// Serves the learner of the run in `directory` as actor number `id`, until the run is over or the
+/// learner is silent.
 pub(crate) fn serve(directory: &Path, id: u32) {
     let (identity, config) = RunDirectory::new(directory).open().unwrap();
     let _presence = Presence::enter(&identity).unwrap();
-    let mut actor = Actor::new(ActorPorts::join(&identity, &config).unwrap(), ActorId(id), &config);
+    let mut actor = SyntheticActor::new(
+        ActorPorts::join(&identity, &config).unwrap(),
+        ActorId(id),
+        &config,
+    );
     actor.report(ActorState::Serving);
     while !actor.is_over && actor.last_heard.elapsed() < PATIENCE {
         actor.listen();
@@ -50,24 +55,25 @@ pub(crate) fn serve(directory: &Path, id: u32) {
     actor.report(ActorState::Leaving);
 }
 
-impl Actor {
+impl SyntheticActor {
     fn new(ports: ActorPorts, id: ActorId, config: &Config) -> Self {
         Self {
             ports,
             id,
-            incarnation: Incarnation(1),
+            incarnation: ActorIncarnation(1),
             heartbeat: config.transport.heartbeat(),
             last_heard: Instant::now(),
-            last_said: Instant::now(),
+            last_report: Instant::now(),
             tickets: VecDeque::new(),
-            has_told_of_waiting: false,
+            has_reported_waiting: false,
             is_over: false,
             latent: config.vae.latent,
             image: Box::new([id.0 as u8; IMAGE_PIXELS]),
         }
     }
 
-    /// Hears what there is to hear and gives a sign of life when one is due, as an actor does before every step.
+    /// Reads pending messages and sends a heartbeat when one is due, as an actor does before every
+    /// step.
     fn listen(&mut self) {
         while let Some(record) = self.ports.receive_control().unwrap() {
             self.last_heard = Instant::now();
@@ -79,22 +85,22 @@ impl Actor {
                 }
             }
         }
-        if self.last_said.elapsed() >= self.heartbeat {
+        if self.last_report.elapsed() >= self.heartbeat {
             self.ports.maintain().unwrap();
             self.report(ActorState::Serving);
         }
     }
 
     fn wait(&mut self) {
-        if !self.has_told_of_waiting {
-            self.has_told_of_waiting = true;
+        if !self.has_reported_waiting {
+            self.has_reported_waiting = true;
             self.report(ActorState::Serving);
         }
         self.ports.wait(self.heartbeat).unwrap();
     }
 
     fn fly(&mut self, ticket: &Ticket) {
-        self.has_told_of_waiting = false;
+        self.has_reported_waiting = false;
         for step in 0..STEPS {
             self.listen();
             let mut record = self.record(ticket, step);
@@ -110,7 +116,7 @@ impl Actor {
         self.ports.wake_learner().unwrap();
     }
 
-    /// A record with all that an actor writes when it observes, the image included.
+    /// Returns a record with everything that an actor writes when it observes, the image included.
     fn record(&self, ticket: &Ticket, step: u32) -> LoanedTransition {
         let mut record = self.ports.loan_transition().unwrap();
         record.begin(ticket, self.id, self.incarnation, step);
@@ -123,16 +129,16 @@ impl Actor {
     }
 
     fn report(&mut self, state: ActorState) {
-        self.last_said = Instant::now();
+        self.last_report = Instant::now();
         let status = ActorStatus {
             actor: self.id,
             incarnation: self.incarnation,
             pid: std::process::id(),
             state,
-            // As if there had been a snapshot.
+            // As if a snapshot had arrived.
             newest_policy: Some(PolicyVersion(0)),
-            flights_flown: 0,
-            times: Times::default(),
+            episodes_flown: 0,
+            times: StageTimes::default(),
         };
         self.ports
             .send_status(StatusRecord::new(self.ports.run(), &status))

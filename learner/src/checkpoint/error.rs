@@ -1,106 +1,130 @@
-//! What can go wrong with a checkpoint.
+//! Errors of checkpoints.
 
 use std::io;
 use std::path::PathBuf;
 
-/// Why a checkpoint cannot be written or used. Every variant names the file.
+/// Reason why a checkpoint cannot be written or used. Every variant names the file.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
     /// The file system refuses.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
-        /// What was tried, as a verb.
+        /// Attempted action, as a verb.
         action: &'static str,
-        /// The file or directory.
+        /// Path of the file or directory.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: io::Error,
     },
-    /// The manifest is not one that this program wrote.
+    /// The manifest is not as this program wrote it.
     #[error("{} is damaged: {problem}", path.display())]
     Manifest {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the damage.
         problem: String,
     },
-    /// It was written by another version.
-    #[error("{} has checkpoint format {found}, but this program reads format {expected}: resume it with the version that wrote it", path.display())]
+    /// Another version wrote the checkpoint.
+    #[error(
+        "{} has checkpoint format {found}, but this program reads format {expected}: \
+         resume it with the version that wrote it",
+        path.display()
+    )]
     Format {
-        /// The manifest.
+        /// Path of the manifest.
         path: PathBuf,
-        /// Its format.
+        /// Format of the manifest.
         found: u32,
-        /// Ours.
+        /// Format that this program reads.
         expected: u32,
     },
-    /// It belongs to another configuration.
-    #[error("{} was written under another configuration: {differences}; a run is resumed under the configuration it began with", path.display())]
+    /// The checkpoint belongs to another configuration.
+    #[error(
+        "{} was written under another configuration: {differences}; \
+         a run is resumed under the configuration it started with",
+        path.display()
+    )]
     Configuration {
-        /// The checkpoint.
+        /// Path of the checkpoint.
         path: PathBuf,
-        /// Each key with both values.
+        /// Each differing key with both values.
         differences: String,
     },
-    /// A file is not what was written.
-    #[error("{} is damaged: {what} is {found} where the manifest says {expected}", path.display())]
+    /// A file differs from what was written.
+    #[error(
+        "{} is damaged: {what} is {found} where the manifest says {expected}",
+        path.display()
+    )]
     Damaged {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
         /// `size` or `checksum`.
         what: &'static str,
-        /// Found in the file.
+        /// Value of the file.
         found: String,
-        /// According to the manifest.
+        /// Value in the manifest.
         expected: String,
     },
-    /// A file's checksum is right, but its content makes no sense.
+    /// A file's checksum is right, but its content is invalid.
     #[error("{} cannot be used: {problem}", path.display())]
     Content {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Description of the problem.
         problem: String,
     },
-    /// It counts on files beside it that are not as they were.
-    #[error("the checkpoint of flight {flights} does not fit: {problem}")]
+    /// Files beside the checkpoint that it relies on have changed.
+    #[error("the checkpoint of episode {episodes} does not fit: {problem}")]
     Unfit {
-        /// The checkpoint.
-        flights: u64,
-        /// What does not fit, with the file.
+        /// Episode of the checkpoint.
+        episodes: u64,
+        /// Description of what does not fit, with the file.
         problem: String,
     },
-    /// There are checkpoints, but none can be used.
+    /// Checkpoints exist, but none can be used.
     #[error(
-        "none of the {count} checkpoints in {} can be used. The newest: {newest}. Mend that; or, to train anew from the first flight, remove that folder and flights.csv", directory.display()
+        "none of the {count} checkpoints in {} can be used. The newest: {newest}. Repair it; \
+         or, to train again from the first episode, remove that folder and episodes.csv",
+        directory.display()
     )]
     NoneUsable {
-        /// Where they lie.
+        /// Folder of the checkpoints.
         directory: PathBuf,
-        /// How many there are.
+        /// Number of checkpoints.
         count: usize,
-        /// Why the newest cannot be used.
+        /// Reason why the newest one cannot be used.
         #[source]
         newest: Box<CheckpointError>,
     },
-    /// The writing thread is gone.
-    #[error("the thread that writes checkpoints to {} ended early", directory.display())]
+    /// The writing thread has ended.
+    #[error(
+        "the thread that writes checkpoints to {} ended early",
+        directory.display()
+    )]
     WriterGone {
-        /// Where it wrote to.
+        /// Folder that it wrote to.
         directory: PathBuf,
     },
 }
 
 impl CheckpointError {
-    /// Whether the checkpoint is damaged, so that an older one may do; one of another version or configuration is sound, and older ones are no better.
+    /// `true` if the checkpoint is damaged, so that an older one may help. A checkpoint of another
+    /// version or configuration is sound, and older ones are no better.
     pub(super) fn is_damage(&self) -> bool {
         !matches!(self, Self::Format { .. } | Self::Configuration { .. })
     }
 
-    /// Names `path` and `action` of an I/O error.
-    pub(super) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(io::Error) -> Self {
+    /// Adds `path` and `action` to an I/O error.
+    pub(super) fn io(
+        action: &'static str,
+        path: impl Into<PathBuf>,
+    ) -> impl FnOnce(io::Error) -> Self {
         let path = path.into();
-        move |source| Self::Io { action, path, source }
+        move |source| Self::Io {
+            action,
+            path,
+            source,
+        }
     }
 }

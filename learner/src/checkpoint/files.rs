@@ -1,4 +1,4 @@
-//! The files of a checkpoint: from state to bytes and back.
+//! Conversion of a checkpoint's state to files and back.
 
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -7,13 +7,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, durable};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_run::durable;
+use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::manifest::Manifest;
-use super::{CheckpointError, CheckpointState, Progress};
+use super::{CheckpointError, CheckpointState, TrainingProgress};
 use crate::replay::{ReplayState, RingState};
 use crate::state::{NamedTensor, TensorValues};
 
@@ -21,45 +22,50 @@ const TENSORS: &str = "tensors.safetensors";
 const REPLAY: &str = "replay.safetensors";
 const SNAPSHOTS: &str = "snapshots.safetensors";
 const PROGRESS: &str = "progress.bin";
-/// The configuration.
+/// File of the configuration.
 pub(super) const CONFIG: &str = "config.toml";
-/// All files but the manifest.
+/// All files except the manifest.
 pub(super) const NAMES: [&str; 5] = [TENSORS, REPLAY, SNAPSHOTS, PROGRESS, CONFIG];
 
-/// Bytes that reading `progress.bin` may set aside: two windows of a million flights, and room for the rest. A length that makes no sense ends there.
+/// Bytes that decoding `progress.bin` may allocate: two windows of a million episodes, and the
+/// rest. It stops a damaged length.
 const PROGRESS_LIMIT: usize = 64 << 20;
 
 // Safetensors are little-endian, and values are written as they lie in memory.
 const _: () = assert!(cfg!(target_endian = "little"));
 
-/// `progress.bin`: counters, and what of the replay buffer is no tensor.
+/// Content of `progress.bin`: counters, and the numbers of the replay buffer that are not tensors.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct ProgressFile {
-    progress: Progress,
+    progress: TrainingProgress,
     success_inserted: u64,
     regular_inserted: u64,
-    /// Blocks of images in the replay buffer; `None` once the VAE is frozen.
+    /// Number of image blocks in the replay buffer; `None` once the VAE is frozen.
     image_blocks: Option<u64>,
 }
 
-/// Writes all files but the manifest into `directory`; `config` is the portable configuration.
-pub(super) fn write(directory: &Path, state: &CheckpointState, config: &str) -> Result<(), CheckpointError> {
+/// Writes all files except the manifest into `directory`. `config`: the portable configuration.
+pub(super) fn write(
+    directory: &Path,
+    state: &CheckpointState,
+    config: &str,
+) -> Result<(), CheckpointError> {
     let tensors = state
         .tensors
         .iter()
-        .map(|tensor| (tensor.name.clone(), Borrowed::of(tensor)))
+        .map(|tensor| (tensor.name.clone(), BorrowedTensor::of(tensor)))
         .collect();
     write_tensors(&directory.join(TENSORS), tensors)?;
-    pass(FaultPoint::CheckpointTensors);
+    die_if_armed(FaultPoint::CheckpointTensors);
     write_tensors(&directory.join(REPLAY), replay_tensors(&state.replay))?;
-    pass(FaultPoint::CheckpointReplay);
+    die_if_armed(FaultPoint::CheckpointReplay);
     let snapshots = state
         .snapshots
         .iter()
         .map(|snapshot| {
             (
                 snapshot.version.to_string(),
-                Borrowed::flat(Dtype::F32, &snapshot.values),
+                BorrowedTensor::flat(Dtype::F32, &snapshot.values),
             )
         })
         .collect();
@@ -68,13 +74,17 @@ pub(super) fn write(directory: &Path, state: &CheckpointState, config: &str) -> 
         progress: state.progress.clone(),
         success_inserted: state.replay.success.inserted,
         regular_inserted: state.replay.regular.inserted,
-        image_blocks: state.replay.images.as_ref().map(|blocks| blocks.len() as u64),
+        image_blocks: state
+            .replay
+            .images
+            .as_ref()
+            .map(|blocks| blocks.len() as u64),
     };
     let bytes = bincode::serde::encode_to_vec(&progress, bincode::config::standard())
         .expect("progress consists of numbers, texts and lists of them");
     write_bytes(&directory.join(PROGRESS), &bytes)?;
     write_bytes(&directory.join(CONFIG), config.as_bytes())?;
-    pass(FaultPoint::CheckpointProgress);
+    die_if_armed(FaultPoint::CheckpointProgress);
     Ok(())
 }
 
@@ -85,36 +95,41 @@ pub(super) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), CheckpointErr
         .map_err(CheckpointError::io("write", path))
 }
 
-/// Reads what [`write`] wrote, each file checked against `manifest`.
-pub(super) fn read(directory: &Path, manifest: &Manifest) -> Result<CheckpointState, CheckpointError> {
+/// Reads the files that [`write`] wrote, each checked against `manifest`.
+pub(super) fn read(
+    directory: &Path,
+    manifest: &Manifest,
+) -> Result<CheckpointState, CheckpointError> {
     let path = directory.join(PROGRESS);
     let bytes = manifest.read_file(directory, PROGRESS)?;
-    let file = parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
-    let replay = read_replay(&Stored::open(directory, REPLAY, manifest)?, &file)?;
+    let file =
+        parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
+    let replay = read_replay(&TensorFile::open(directory, REPLAY, manifest)?, &file)?;
     Ok(CheckpointState {
         progress: file.progress,
-        tensors: read_tensors(&Stored::open(directory, TENSORS, manifest)?)?,
+        tensors: read_tensors(&TensorFile::open(directory, TENSORS, manifest)?)?,
         replay,
-        snapshots: read_snapshots(&Stored::open(directory, SNAPSHOTS, manifest)?)?,
+        snapshots: read_snapshots(&TensorFile::open(directory, SNAPSHOTS, manifest)?)?,
     })
 }
 
 fn parse_progress(bytes: &[u8]) -> Result<ProgressFile, String> {
     let limited = bincode::config::standard().with_limit::<PROGRESS_LIMIT>();
-    let (file, read) = bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
+    let (file, read) =
+        bincode::serde::decode_from_slice(bytes, limited).map_err(|error| error.to_string())?;
     match bytes.len() - read {
         0 => Ok(file),
-        more => Err(format!("{more} bytes follow what it should hold")),
+        more => Err(format!("{more} bytes follow its expected end")),
     }
 }
 
-fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
+fn read_snapshots(stored: &TensorFile) -> Result<Vec<Snapshot>, CheckpointError> {
     let tensors = stored.tensors()?;
     let mut snapshots = Vec::new();
     for name in tensors.names() {
         let version = name
             .parse()
-            .map_err(|_| stored.unusable(format!("{name} is no snapshot's version")))?;
+            .map_err(|_| stored.unusable(format!("{name} is not a snapshot's version")))?;
         let values = stored.tensor(&tensors, name, Dtype::F32)?;
         snapshots.push(Snapshot {
             version: PolicyVersion(version),
@@ -125,17 +140,23 @@ fn read_snapshots(stored: &Stored) -> Result<Vec<Snapshot>, CheckpointError> {
     Ok(snapshots)
 }
 
-fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
+fn replay_tensors(replay: &ReplayState) -> Vec<(String, BorrowedTensor<'_>)> {
     let mut tensors = Vec::new();
     for (part, ring) in [("success", &replay.success), ("regular", &replay.regular)] {
-        tensors.push((format!("{part}.rows"), Borrowed::flat(Dtype::F32, &ring.rows)));
-        tensors.push((format!("{part}.images"), Borrowed::flat(Dtype::U32, &ring.images)));
+        tensors.push((
+            format!("{part}.rows"),
+            BorrowedTensor::flat(Dtype::F32, &ring.rows),
+        ));
+        tensors.push((
+            format!("{part}.images"),
+            BorrowedTensor::flat(Dtype::U32, &ring.images),
+        ));
     }
     for (number, block) in replay.images.iter().flatten().enumerate() {
         let shape = vec![block.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
         tensors.push((
             block_name(number as u64),
-            Borrowed {
+            BorrowedTensor {
                 dtype: Dtype::U8,
                 shape,
                 bytes: block,
@@ -145,7 +166,7 @@ fn replay_tensors(replay: &ReplayState) -> Vec<(String, Borrowed<'_>)> {
     tensors
 }
 
-fn read_replay(stored: &Stored, file: &ProgressFile) -> Result<ReplayState, CheckpointError> {
+fn read_replay(stored: &TensorFile, file: &ProgressFile) -> Result<ReplayState, CheckpointError> {
     let tensors = stored.tensors()?;
     let ring = |part: &str, inserted| {
         let rows = stored.tensor(&tensors, &format!("{part}.rows"), Dtype::F32)?;
@@ -158,7 +179,10 @@ fn read_replay(stored: &Stored, file: &ProgressFile) -> Result<ReplayState, Chec
     };
     let block = |number| {
         Ok(Arc::new(
-            stored.tensor(&tensors, &block_name(number), Dtype::U8)?.data().to_vec(),
+            stored
+                .tensor(&tensors, &block_name(number), Dtype::U8)?
+                .data()
+                .to_vec(),
         ))
     };
     Ok(ReplayState {
@@ -175,7 +199,10 @@ fn block_name(number: u64) -> String {
     format!("images.{number:06}")
 }
 
-fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<(), CheckpointError> {
+fn write_tensors(
+    path: &Path,
+    tensors: Vec<(String, BorrowedTensor<'_>)>,
+) -> Result<(), CheckpointError> {
     let mut names = HashSet::new();
     if let Some((name, _)) = tensors.iter().find(|(name, _)| !names.insert(name)) {
         let problem = format!("two tensors are called {name}, and one would be lost");
@@ -193,7 +220,7 @@ fn write_tensors(path: &Path, tensors: Vec<(String, Borrowed<'_>)>) -> Result<()
     })
 }
 
-fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
+fn read_tensors(stored: &TensorFile) -> Result<Vec<NamedTensor>, CheckpointError> {
     let mut named = Vec::new();
     for (name, view) in stored.tensors()?.iter() {
         let bytes = view.data();
@@ -201,7 +228,9 @@ fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
             Dtype::F32 => TensorValues::F32(bytemuck::allocation::pod_collect_to_vec(bytes)),
             Dtype::F64 => TensorValues::F64(bytemuck::allocation::pod_collect_to_vec(bytes)),
             Dtype::I64 => TensorValues::I64(bytemuck::allocation::pod_collect_to_vec(bytes)),
-            other => return Err(stored.unusable(format!("tensor {name} has values of type {other:?}"))),
+            other => {
+                return Err(stored.unusable(format!("tensor {name} has values of type {other:?}")));
+            }
         };
         named.push(NamedTensor {
             name: name.to_owned(),
@@ -209,18 +238,18 @@ fn read_tensors(stored: &Stored) -> Result<Vec<NamedTensor>, CheckpointError> {
             values,
         });
     }
-    // The file orders tensors by their type; the order given to it means nothing, so one is chosen.
+    // The file orders tensors by type and does not keep the given order, so one is chosen here.
     named.sort_by(|left, right| left.name.cmp(&right.name));
     Ok(named)
 }
 
 /// A safetensors file in memory, its checksum verified.
-struct Stored {
+struct TensorFile {
     path: PathBuf,
     bytes: Vec<u8>,
 }
 
-impl Stored {
+impl TensorFile {
     fn open(directory: &Path, name: &str, manifest: &Manifest) -> Result<Self, CheckpointError> {
         Ok(Self {
             path: directory.join(name),
@@ -238,7 +267,9 @@ impl Stored {
         name: &str,
         dtype: Dtype,
     ) -> Result<TensorView<'a>, CheckpointError> {
-        let view = tensors.tensor(name).map_err(|error| self.unusable(error.to_string()))?;
+        let view = tensors
+            .tensor(name)
+            .map_err(|error| self.unusable(error.to_string()))?;
         if view.dtype() != dtype {
             let found = view.dtype();
             return Err(self.unusable(format!(
@@ -256,14 +287,14 @@ impl Stored {
     }
 }
 
-/// Values as they lie in memory: nothing is copied on the way to the file.
-struct Borrowed<'a> {
+/// Values as they lie in memory, written to the file without a copy.
+struct BorrowedTensor<'a> {
     dtype: Dtype,
     shape: Vec<usize>,
     bytes: &'a [u8],
 }
 
-impl<'a> Borrowed<'a> {
+impl<'a> BorrowedTensor<'a> {
     fn of(tensor: &'a NamedTensor) -> Self {
         let (dtype, bytes) = match &tensor.values {
             TensorValues::F32(values) => (Dtype::F32, bytemuck::cast_slice(values)),
@@ -286,7 +317,7 @@ impl<'a> Borrowed<'a> {
     }
 }
 
-impl View for Borrowed<'_> {
+impl View for BorrowedTensor<'_> {
     fn dtype(&self) -> Dtype {
         self.dtype
     }

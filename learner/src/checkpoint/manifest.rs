@@ -1,4 +1,4 @@
-//! The manifest: what a checkpoint consists of, and how each part is recognised as undamaged.
+//! The manifest: lists a checkpoint's files, with sizes and checksums that reveal damage.
 
 use std::fs::{self, File};
 use std::io::{self, BufReader};
@@ -9,18 +9,19 @@ use xxhash_rust::xxh3::{Xxh3Default, xxh3_64};
 
 use super::CheckpointError;
 
-/// Its name in the checkpoint's directory.
+/// Name of the manifest in the checkpoint's directory.
 pub(super) const NAME: &str = "manifest.json";
 
-/// Changes with everything that makes older checkpoints unreadable.
+/// Version of the checkpoint format; changes whenever older checkpoints become unreadable.
 pub(super) const FORMAT: u32 = 7;
 
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;
 
-/// What stands before the manifest's own checksum, which is its last field in every format: a damaged one is told from another format.
+/// Text before the manifest's own checksum. The checksum is the last field in every format, so that
+/// damage can be distinguished from another format.
 const OWN_CHECKSUM: &str = ",\n  \"xxh3\": \"";
-/// What stands behind it.
+/// Text after the checksum.
 const END: &str = "\"\n}\n";
 
 /// Format, configuration, and the files with their checksums.
@@ -30,55 +31,58 @@ pub(super) struct Manifest {
     format: u32,
     /// `Config::digest`, hexadecimal: JSON's numbers do not hold 64 bits.
     config_digest: String,
-    flights: u64,
-    files: Vec<Entry>,
+    episodes: u64,
+    files: Vec<ManifestEntry>,
 }
 
-/// A file of the checkpoint.
+/// Name, size and checksum of one file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Entry {
+struct ManifestEntry {
     name: String,
     bytes: u64,
-    /// Hexadecimal.
+    /// Checksum, hexadecimal.
     xxh3: String,
 }
 
 impl Manifest {
-    /// Of the files `names` in `directory`, as they are now.
+    /// Describes the files `names` in `directory`, as they are now.
     pub(super) fn of(
         directory: &Path,
         names: &[&str],
-        flights: u64,
+        episodes: u64,
         config_digest: u64,
     ) -> Result<Self, CheckpointError> {
         let files = names
             .iter()
-            .map(|name| Entry::of(directory, name))
+            .map(|name| ManifestEntry::of(directory, name))
             .collect::<Result<_, _>>()?;
         Ok(Self {
             format: FORMAT,
             config_digest: hex(config_digest),
-            flights,
+            episodes,
             files,
         })
     }
 
-    /// Its text: JSON, with a checksum of all that stands before it as the last field.
+    /// Returns the text: JSON, with a checksum of everything before it as the last field.
     pub(super) fn to_text(&self) -> String {
         let json = serde_json::to_string_pretty(self).expect("a manifest is plain data");
-        let body = json.strip_suffix("\n}").expect("an object of several fields ends so");
+        let body = json
+            .strip_suffix("\n}")
+            .expect("an object of several fields ends so");
         format!("{body}{OWN_CHECKSUM}{}{END}", hex(xxh3_64(body.as_bytes())))
     }
 
-    /// Reads the manifest of the checkpoint in `directory` and checks that it is undamaged and of this format.
+    /// Reads the manifest of the checkpoint in `directory`; checks that it is undamaged and has
+    /// this format.
     pub(super) fn read(directory: &Path) -> Result<Self, CheckpointError> {
         let path = directory.join(NAME);
         let bytes = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
         Self::parse(&bytes, &path)
     }
 
-    /// Reads the manifest from the `bytes` of its file at `path`.
+    /// Parses the manifest from the `bytes` of its file at `path`.
     fn parse(bytes: &[u8], path: &Path) -> Result<Self, CheckpointError> {
         let damaged = |problem: String| CheckpointError::Manifest {
             path: path.to_owned(),
@@ -88,7 +92,9 @@ impl Manifest {
         let body = text
             .strip_suffix(END)
             .and_then(|text| text.rsplit_once(OWN_CHECKSUM))
-            .and_then(|(body, checksum)| (hex(xxh3_64(body.as_bytes())) == checksum).then_some(body))
+            .and_then(|(body, checksum)| {
+                (hex(xxh3_64(body.as_bytes())) == checksum).then_some(body)
+            })
             .ok_or_else(|| damaged("its checksum is not that of its content".to_owned()))?;
         let json = format!("{body}\n}}");
         // The format is read first: another one may have other fields.
@@ -96,7 +102,8 @@ impl Manifest {
         struct Format {
             format: u32,
         }
-        let Format { format: found } = serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))?;
+        let Format { format: found } =
+            serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))?;
         if found != FORMAT {
             return Err(CheckpointError::Format {
                 path: path.to_owned(),
@@ -107,28 +114,32 @@ impl Manifest {
         serde_json::from_str(&json).map_err(|error| damaged(error.to_string()))
     }
 
-    /// Checks that every file in `directory` is what was written.
+    /// Checks that every file in `directory` is as it was written.
     pub(super) fn verify(&self, directory: &Path) -> Result<(), CheckpointError> {
         for entry in &self.files {
             let path = directory.join(&entry.name);
-            let found = Entry::of(directory, &entry.name)?;
+            let found = ManifestEntry::of(directory, &entry.name)?;
             entry.check(&path, found.bytes, &found.xxh3)?;
         }
         Ok(())
     }
 
-    /// Fingerprint of the configuration it was written under.
+    /// `true` if the checkpoint was written under the configuration with this digest.
     pub(super) fn is_of(&self, config_digest: u64) -> bool {
         self.config_digest == hex(config_digest)
     }
 
-    /// Flights committed according to the manifest.
-    pub(super) fn flights(&self) -> u64 {
-        self.flights
+    /// Number of episodes committed, according to the manifest.
+    pub(super) fn episodes(&self) -> u64 {
+        self.episodes
     }
 
-    /// Reads the file `name` in `directory` and checks that it is what was written.
-    pub(super) fn read_file(&self, directory: &Path, name: &str) -> Result<Vec<u8>, CheckpointError> {
+    /// Reads the file `name` in `directory`, and checks that it is as it was written.
+    pub(super) fn read_file(
+        &self,
+        directory: &Path,
+        name: &str,
+    ) -> Result<Vec<u8>, CheckpointError> {
         let entry = self
             .files
             .iter()
@@ -144,11 +155,11 @@ impl Manifest {
     }
 }
 
-impl Entry {
-    /// Of the file `name` in `directory`, as it is now.
+impl ManifestEntry {
+    /// Describes the file `name` in `directory`, as it is now.
     fn of(directory: &Path, name: &str) -> Result<Self, CheckpointError> {
         let path = directory.join(name);
-        // Piece by piece: depth images can be larger than what is wise to hold twice.
+        // In pieces: depth images can be too large to hold twice in memory.
         let mut hasher = Xxh3Default::new();
         let bytes = File::open(&path)
             .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
@@ -160,7 +171,7 @@ impl Entry {
         })
     }
 
-    /// Compares what was found at `path` with what was written.
+    /// Compares the file at `path` with its entry.
     fn check(&self, path: &Path, bytes: u64, xxh3: &str) -> Result<(), CheckpointError> {
         let damaged = |what, found, expected| CheckpointError::Damaged {
             path: path.to_owned(),

@@ -1,19 +1,22 @@
 //! Checkpoints: everything that determines the rest of a run, in a directory of its own.
 //!
-//! A run resumed from one continues bit for bit as if it had never stopped, so all of it is here: parameters and moments of every network, the replay
-//! buffer with the depth images it still needs, snapshots that are still flown or are the best, counters, averages, how far the files of metrics
-//! had come. Random generators are not: they are derived anew for every epoch.
+//! On the type of processor that began it, a run resumed from a checkpoint continues bit for bit as
+//! if it had never stopped. So a checkpoint holds parameters and moments of every network, the
+//! replay buffer with the depth images still needed, snapshots that still fly or are the best,
+//! counters, averages, and the lengths of the metrics files. It holds no random generators: they
+//! are derived again for every epoch.
 //!
-//! `checkpoints/flight-<n>/` holds
+//! `checkpoints/episode-<n>/` contains
 //! - `tensors.safetensors`: parameters, targets, moments, log α;
 //! - `replay.safetensors`: rows of both parts, numbers of their images, images;
-//! - `snapshots.safetensors`: snapshots by their versions;
-//! - `progress.bin`: [`Progress`], bincode;
-//! - `config.toml`: the configuration, to say what differs from another one;
-//! - `manifest.json`: format, size and checksum of each of the above, and a checksum of itself.
+//! - `snapshots.safetensors`: snapshots by version;
+//! - `progress.bin`: [`TrainingProgress`], bincode;
+//! - `config.toml`: the configuration, to show differences from another one;
+//! - `manifest.json`: format, size and checksum of each file above, and its own checksum.
 //!
-//! It is written aside and renamed into place when all of it is on disk ([`store`]): a directory of that name is complete, and what is damaged later
-//! is refused by its checksum, never learned from.
+//! It is written under another name and renamed when everything is on disk ([`store`]). So a
+//! directory of this name is complete. Later damage is detected by checksum, and damaged state is
+//! never learned from.
 
 mod error;
 mod files;
@@ -29,10 +32,10 @@ use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Exploration;
 
-use crate::flights::assembly::Keep;
+use crate::episodes::assembly::KeptData;
 use crate::metrics::MetricsState;
 use crate::replay::ReplayState;
-use crate::spent::Spent;
+use crate::spent::RunCosts;
 use crate::state::NamedTensor;
 
 pub use error::CheckpointError;
@@ -42,101 +45,102 @@ pub use writer::CheckpointWriter;
 /// Everything that determines the rest of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CheckpointState {
-    /// How far the run is.
-    pub progress: Progress,
-    /// Everything that updates change, by name.
+    /// Counters and results so far.
+    pub progress: TrainingProgress,
+    /// All tensors that updates change, by name.
     pub tensors: Vec<NamedTensor>,
-    /// The replay buffer's content.
+    /// Content of the replay buffer.
     pub replay: ReplayState,
     /// Snapshots that are still needed, the newest among them, by rising version.
     pub snapshots: Vec<Snapshot>,
 }
 
-/// How far a run is: every counter that decides what happens next, and what it came to so far.
+/// Progress of a run: every counter that decides what happens next, and the results so far.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
-    /// Training flights committed; the checkpoint's name.
-    pub flights: u64,
+pub struct TrainingProgress {
+    /// Training episodes committed; the checkpoint's name.
+    pub episodes: u64,
     /// Epochs learned from.
     pub epochs: u64,
-    /// The version of the newest snapshot. One is published after each epoch, and after each leg within one that brought an update.
+    /// Version of the newest snapshot. One is published after each epoch, and after each segment
+    /// within an epoch that brought an update.
     pub version: u64,
     /// SHA-256 of the newest snapshot.
     pub policy_sha256: String,
     /// Environment steps committed.
     pub environment_steps: u64,
-    /// Steps the VAE was trained.
+    /// VAE steps done.
     pub vae_steps: u64,
     /// Policy updates done.
     pub policy_updates: u64,
-    /// Epochs whose flights were ordered and not learned from, in order.
-    pub in_the_air: Vec<EpochOrder>,
-    /// Evaluations flown to confirm a candidate for the best snapshot; numbers their flights.
+    /// Orders of epochs that are not learned from yet, in order.
+    pub in_flight: Vec<EpochOrder>,
+    /// Evaluations flown to confirm candidates; numbers their episodes.
     pub evaluations: u64,
-    /// Evaluation flights flown.
-    pub evaluation_flights: u64,
-    /// Flights committed when the latest candidate was confirmed.
+    /// Confirmation and evaluation episodes flown.
+    pub evaluation_episodes: u64,
+    /// Episodes committed when the latest candidate was confirmed.
     pub latest_candidate: Option<u64>,
-    /// The best snapshot so far.
+    /// Best snapshot so far.
     pub best: Option<BestSnapshot>,
-    /// When a candidate first did what it was trained for.
+    /// Effort until a candidate first reached the configured success rate.
     pub trained: Option<Trained>,
-    /// Averages over the latest flights, and where the files of metrics end.
+    /// Averages over the latest episodes, and the lengths of the metrics files.
     pub metrics: MetricsState,
     /// Time and losses so far.
-    pub spent: Spent,
+    pub spent: RunCosts,
 }
 
-impl Progress {
-    /// Of a run that has not begun, whose averages are over `window_flights` flights.
-    pub fn start(window_flights: usize) -> Self {
+impl TrainingProgress {
+    /// Progress of a run that has not begun; its averages are over `window_episodes` episodes.
+    pub fn start(window_episodes: usize) -> Self {
         Self {
-            flights: 0,
+            episodes: 0,
             epochs: 0,
             version: 0,
             policy_sha256: String::new(),
             environment_steps: 0,
             vae_steps: 0,
             policy_updates: 0,
-            in_the_air: Vec::new(),
+            in_flight: Vec::new(),
             evaluations: 0,
-            evaluation_flights: 0,
+            evaluation_episodes: 0,
             latest_candidate: None,
             best: None,
             trained: None,
-            metrics: MetricsState::new(window_flights),
-            spent: Spent::default(),
+            metrics: MetricsState::new(window_episodes),
+            spent: RunCosts::default(),
         }
     }
 
-    /// The newest snapshot's version.
+    /// Version of the newest snapshot.
     pub fn version(&self) -> PolicyVersion {
         PolicyVersion(self.version)
     }
 }
 
-/// Flights of one epoch as they were ordered: what makes their tickets, besides configuration and run.
+/// Order of one epoch's episodes. With configuration and run, it determines their tickets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EpochOrder {
-    /// The epoch.
+    /// Epoch.
     pub epoch: u64,
-    /// The snapshot it is flown with.
+    /// Version of the snapshot that the epoch is flown with.
     pub policy_version: u64,
-    /// How actions are chosen.
+    /// Exploration of the episodes.
     pub exploration: Exploration,
-    /// What is kept of its flights.
-    pub keep: Keep,
+    /// Data to keep of the episodes.
+    pub keep: KeptData,
 }
 
-/// The best snapshot, and why it is.
+/// The best snapshot and its results.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BestSnapshot {
-    /// The snapshot.
+    /// Version of the snapshot.
     pub policy_version: u64,
-    /// Training flights committed when it was chosen.
-    pub flights: u64,
-    /// Walls passed in the training flights of the window then, on average.
+    /// Training episodes committed when it was chosen.
+    pub episodes: u64,
+    /// Mean number of walls passed in the training episodes of the window at that time.
     pub window_walls_passed: f64,
-    /// Walls passed in the evaluation flights that confirmed it, on average.
+    /// Mean number of walls passed in its confirmation episodes.
     pub confirmed_walls_passed: f64,
 }

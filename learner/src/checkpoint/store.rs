@@ -1,22 +1,23 @@
-//! The folder of checkpoints: writing into place, finding, loading, removing old ones.
+//! The folder of checkpoints: writing, finding, loading, and removing old ones.
 //!
-//! Names that begin with a dot are work in progress and never read: a checkpoint is written under such a name, all of it brought to disk, and renamed; to be
-//! removed, it is renamed back to one first. One that is written again, for the same flight, keeps its predecessor beside it until it is in place:
-//! there is no moment without a sound checkpoint, once there is one.
+//! Names that begin with a dot are work in progress and never read. A checkpoint is written under
+//! such a name, synced to disk, and renamed. For removal it is first renamed back to such a name. A
+//! checkpoint that replaces one of the same episode leaves the old one beside it until it is in
+//! place. So there is always a sound checkpoint, once there is one.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_protocol::durable;
-use skein_protocol::fault::{FaultPoint, pass};
+use skein_run::durable;
+use skein_run::fault::{FaultPoint, die_if_armed};
 use tracing::warn;
 
 use super::manifest::{self, Manifest};
 use super::{CheckpointError, CheckpointState, files};
 
-/// Ends the name of a checkpoint that is about to be replaced by one of the same flight.
+/// Suffix of a checkpoint that is about to be replaced by one of the same episode.
 const REPLACED: &str = ".replaced";
 
 /// The checkpoints of a run.
@@ -29,18 +30,19 @@ pub struct CheckpointStore {
 
 /// A checkpoint in the folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Place {
-    flights: u64,
+struct StoredCheckpoint {
+    episodes: u64,
     path: PathBuf,
 }
 
-/// Where in `checkpoints` the state after `flights` committed flights lies.
-pub fn checkpoint_directory(checkpoints: &Path, flights: u64) -> PathBuf {
-    checkpoints.join(format!("flight-{flights}"))
+/// Path in `checkpoints` of the state after `episodes` committed episodes.
+pub fn checkpoint_directory(checkpoints: &Path, episodes: u64) -> PathBuf {
+    checkpoints.join(format!("episode-{episodes}"))
 }
 
 impl CheckpointStore {
-    /// The checkpoints in `directory` of the run configured by `config`; the newest few that are sound are kept, as many as `config` says.
+    /// Opens the checkpoints in `directory` of the run that `config` describes. As many of the
+    /// newest sound ones are kept as `config` says.
     pub fn new(directory: &Path, config: &Config) -> Self {
         Self {
             directory: directory.to_owned(),
@@ -49,65 +51,81 @@ impl CheckpointStore {
         }
     }
 
-    /// Where they lie.
+    /// Path of the folder.
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Writes `state`, and removes those beyond the newest few. Returns where it lies.
+    /// Writes `state`, and removes checkpoints beyond the newest few. Returns the new checkpoint's
+    /// path.
     ///
-    /// `relied_on` are files outside whose content up to now the state counts on: they are brought to disk before the checkpoint is in place.
+    /// `relied_on`: other files on whose present content the state relies. They are synced to disk
+    /// before the checkpoint is in place.
     ///
     /// # Errors
-    /// [`CheckpointError`]; what was there before still is, and what was half written takes no room.
-    pub fn save(&self, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<PathBuf, CheckpointError> {
-        let flights = state.progress.flights;
-        // One name for all: whatever an interrupted write left, of this flight or another, makes room for the next.
+    /// [`CheckpointError`]; earlier checkpoints stay, and nothing half-written remains.
+    pub fn save(
+        &self,
+        state: &CheckpointState,
+        relied_on: &[PathBuf],
+    ) -> Result<PathBuf, CheckpointError> {
+        let episodes = state.progress.episodes;
+        // A single name, so that the leftovers of any interrupted write are removed by the next.
         let aside = self.directory.join(".writing");
         remove(&aside)?;
         if let Err(error) = self.write_aside(&aside, state, relied_on) {
             remove(&aside)?;
             return Err(error);
         }
-        pass(FaultPoint::CheckpointSynced);
-        let place = checkpoint_directory(&self.directory, flights);
+        die_if_armed(FaultPoint::CheckpointSynced);
+        let place = checkpoint_directory(&self.directory, episodes);
         self.make_way(&place)?;
         fs::rename(&aside, &place).map_err(CheckpointError::io("rename into place", &aside))?;
         sync(&self.directory)?;
-        pass(FaultPoint::CheckpointRenamed);
-        self.remove_others(flights)?;
+        die_if_armed(FaultPoint::CheckpointRenamed);
+        self.remove_others(episodes)?;
         Ok(place)
     }
 
-    fn write_aside(&self, aside: &Path, state: &CheckpointState, relied_on: &[PathBuf]) -> Result<(), CheckpointError> {
+    fn write_aside(
+        &self,
+        aside: &Path,
+        state: &CheckpointState,
+        relied_on: &[PathBuf],
+    ) -> Result<(), CheckpointError> {
         durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
-        pass(FaultPoint::CheckpointCreated);
+        die_if_armed(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
-        self.seal(aside, state.progress.flights)?;
-        pass(FaultPoint::CheckpointManifest);
+        self.seal(aside, state.progress.episodes)?;
+        die_if_armed(FaultPoint::CheckpointManifest);
         for name in files::NAMES.iter().chain([&manifest::NAME]) {
             sync(&aside.join(name))?;
         }
         sync(aside)?;
-        // A new file's name is in its folder, which has to be brought to disk as well.
+        // A new file's name lies in its folder, so the folder is synced too.
         let folders: BTreeSet<&Path> = relied_on.iter().filter_map(|path| path.parent()).collect();
         let mut all = relied_on.iter().map(PathBuf::as_path).chain(folders);
         all.try_for_each(sync_once)
     }
 
-    /// Writes the manifest of the files in `directory` as they are now, and so makes them a checkpoint after `flights` flights.
+    /// Writes the manifest of the files in `directory` as they are now, which makes them a
+    /// checkpoint after `episodes` episodes.
     ///
     /// # Errors
     /// [`CheckpointError::Io`] names the file.
-    pub fn seal(&self, directory: &Path, flights: u64) -> Result<(), CheckpointError> {
-        let manifest = Manifest::of(directory, &files::NAMES, flights, self.config.digest())?;
-        files::write_bytes(&directory.join(manifest::NAME), manifest.to_text().as_bytes())
+    pub fn seal(&self, directory: &Path, episodes: u64) -> Result<(), CheckpointError> {
+        let manifest = Manifest::of(directory, &files::NAMES, episodes, self.config.digest())?;
+        files::write_bytes(
+            &directory.join(manifest::NAME),
+            manifest.to_text().as_bytes(),
+        )
     }
 
-    /// Gives the checkpoint at `place`, if there is a sound one, the name under which it is still found until the new one is in its place.
+    /// Renames a sound checkpoint at `place` to the name under which it is still found until the
+    /// new one is in place.
     fn make_way(&self, place: &Path) -> Result<(), CheckpointError> {
         if !is_sound(place) {
-            // Perhaps its predecessor still lies beside it: that one stays.
+            // The predecessor may still lie beside it; then that one stays.
             return self.retire(place);
         }
         let replaced = replaced(place);
@@ -115,18 +133,20 @@ impl CheckpointStore {
         fs::rename(place, replaced).map_err(CheckpointError::io("rename", place))
     }
 
-    /// The flights of which there is a checkpoint, the newest first.
+    /// Lists the episodes with a checkpoint, the newest first. A folder that does not exist has
+    /// none.
     ///
     /// # Errors
-    /// [`CheckpointError::Io`] when the folder cannot be read; a folder that does not exist has none.
+    /// [`CheckpointError::Io`] when the folder cannot be read.
     pub fn list(&self) -> Result<Vec<u64>, CheckpointError> {
-        let mut flights: Vec<u64> = self.places()?.iter().map(|place| place.flights).collect();
-        flights.dedup();
-        Ok(flights)
+        let mut episodes: Vec<u64> = self.places()?.iter().map(|place| place.episodes).collect();
+        episodes.dedup();
+        Ok(episodes)
     }
 
-    /// All checkpoints, the newest first; of two of one flight, the one that replaces the other.
-    fn places(&self) -> Result<Vec<Place>, CheckpointError> {
+    /// Lists all checkpoints, the newest first. Of two with one episode, the replacing one comes
+    /// first.
+    fn places(&self) -> Result<Vec<StoredCheckpoint>, CheckpointError> {
         if !self.directory.exists() {
             return Ok(Vec::new());
         }
@@ -134,62 +154,107 @@ impl CheckpointStore {
         let mut found = Vec::new();
         for entry in fs::read_dir(&self.directory).map_err(io())? {
             let entry = entry.map_err(io())?;
-            // A checkpoint is a directory; whatever else lies here is nobody's business.
+            // A checkpoint is a directory; other entries are ignored.
             if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
                 continue;
             }
             let name = entry.file_name();
-            let flights = name.to_str().and_then(|name| {
-                let number = name.strip_prefix("flight-")?;
-                number.strip_suffix(REPLACED).unwrap_or(number).parse::<u64>().ok()
+            let episodes = name.to_str().and_then(|name| {
+                let number = name.strip_prefix("episode-")?;
+                number
+                    .strip_suffix(REPLACED)
+                    .unwrap_or(number)
+                    .parse::<u64>()
+                    .ok()
             });
-            found.extend(flights.map(|flights| Place {
-                flights,
+            found.extend(episodes.map(|episodes| StoredCheckpoint {
+                episodes,
                 path: self.directory.join(&name),
             }));
         }
-        // The shorter of two names is that of the newer one.
-        found.sort_by_key(|place| (std::cmp::Reverse(place.flights), place.path.as_os_str().len()));
+        // The shorter of two names belongs to the newer one.
+        found.sort_by_key(|place| {
+            (
+                std::cmp::Reverse(place.episodes),
+                place.path.as_os_str().len(),
+            )
+        });
         Ok(found)
     }
 
-    /// Loads the checkpoint after `flights` committed flights.
+    /// Loads the checkpoint after `episodes` committed episodes.
     ///
     /// # Errors
-    /// [`CheckpointError`] names the file that is missing, damaged, or of another version or configuration.
-    pub fn load(&self, flights: u64) -> Result<CheckpointState, CheckpointError> {
-        self.load_from(&Place {
-            flights,
-            path: checkpoint_directory(&self.directory, flights),
+    /// [`CheckpointError`] names the file that is missing, damaged, or of another version or
+    /// configuration.
+    pub fn load(&self, episodes: u64) -> Result<CheckpointState, CheckpointError> {
+        self.load_from(&StoredCheckpoint {
+            episodes,
+            path: checkpoint_directory(&self.directory, episodes),
         })
     }
 
-    fn load_from(&self, place: &Place) -> Result<CheckpointState, CheckpointError> {
+    fn load_from(&self, place: &StoredCheckpoint) -> Result<CheckpointState, CheckpointError> {
         let manifest = Manifest::read(&place.path)?;
         let config = manifest.read_file(&place.path, files::CONFIG)?;
-        if !manifest.is_of(self.config.digest()) {
-            return Err(self.other_configuration(&place.path, &config));
-        }
+        let shorter = match manifest.is_of(self.config.digest()) {
+            true => None,
+            false => Some(self.before_lengthening(&place.path, &config)?),
+        };
         let state = files::read(&place.path, &manifest)?;
+        if let Some(end) = shorter {
+            self.check_before_end(&state, end)?;
+        }
         for (what, found) in [
-            ("the directory's name", place.flights),
-            ("the manifest", manifest.flights()),
+            ("the directory's name", place.episodes),
+            ("the manifest", manifest.episodes()),
         ] {
-            if found != state.progress.flights {
+            if found != state.progress.episodes {
                 return Err(CheckpointError::Content {
                     path: place.path.clone(),
-                    problem: format!("it is of flight {}, but {what} says {found}", state.progress.flights),
+                    problem: format!(
+                        "it is of episode {}, but {what} says {found}",
+                        state.progress.episodes
+                    ),
                 });
             }
         }
-        let window = self.config.evaluation.window_flights;
+        let window = self.config.evaluation.window_episodes;
         if !state.progress.metrics.windows.are_over(window as usize) {
             return Err(CheckpointError::Content {
                 path: place.path.clone(),
-                problem: format!("its averages are not over evaluation.window_flights = {window} flights"),
+                problem: format!(
+                    "its averages are not over evaluation.window_episodes = {window} episodes"
+                ),
             });
         }
         Ok(state)
+    }
+
+    /// Returns `run.episodes` of the checkpoint at `path` with the configuration `config`, which is
+    /// of this run before it was lengthened.
+    fn before_lengthening(&self, path: &Path, config: &[u8]) -> Result<u64, CheckpointError> {
+        self.config
+            .lengthened_from(&String::from_utf8_lossy(config))
+            .ok_or_else(|| self.other_configuration(path, config))
+    }
+
+    /// Checks that nothing in `state`, of a run of `end` episodes, would differ in a longer run.
+    /// At its end, the last epoch may be short, the last snapshot is always a candidate, and no
+    /// epoch after the last was ordered ahead.
+    fn check_before_end(&self, state: &CheckpointState, end: u64) -> Result<(), CheckpointError> {
+        let learning = &self.config.learning;
+        let epochs = end.div_ceil(learning.episodes_per_epoch);
+        if state.progress.epochs + learning.policy_lag.max(1) <= epochs {
+            return Ok(());
+        }
+        Err(CheckpointError::Unfit {
+            episodes: state.progress.episodes,
+            problem: format!(
+                "it is of the end of the run of {end} episodes, and a longer one resumes from \
+                 before that"
+            ),
+        })
     }
 
     fn other_configuration(&self, path: &Path, config: &[u8]) -> CheckpointError {
@@ -198,17 +263,20 @@ impl CheckpointStore {
             path: path.to_owned(),
             differences: match differences {
                 Ok(differences) if !differences.is_empty() => differences.join(", "),
-                _ => "its config.toml says which".to_owned(),
+                _ => "see its config.toml".to_owned(),
             },
         }
     }
 
-    /// Loads the newest checkpoint that is undamaged; `None` when there is none at all. Resuming from an older one costs time, never the result. Each
-    /// damaged one that is newer is given to `passed_over`, and so is one that does not fit what lies beside it, of which `check` tells.
+    /// Loads the newest undamaged checkpoint; `None` if there is no checkpoint at all. Resuming
+    /// from an older one costs time but does not change the result. `check` may refuse a checkpoint
+    /// that does not fit the files beside it. Every newer checkpoint that is damaged or refused is
+    /// reported to `passed_over`.
     ///
     /// # Errors
-    /// [`CheckpointError::NoneUsable`] when all are damaged: a run is not begun anew without a word. [`CheckpointError::Format`] or
-    /// [`CheckpointError::Configuration`] when the newest undamaged one is of another version or configuration.
+    /// [`CheckpointError::NoneUsable`] when none is usable: a run is not silently started again.
+    /// [`CheckpointError::Format`] or [`CheckpointError::Configuration`] when the newest undamaged
+    /// one is of another version or configuration.
     pub fn load_newest(
         &self,
         check: impl Fn(&CheckpointState) -> Result<(), CheckpointError>,
@@ -237,27 +305,29 @@ impl CheckpointStore {
         })
     }
 
-    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones are of a future that this run has left by resuming from an
-    /// earlier one.
+    /// Keeps the checkpoint just written and the newest sound ones before it. Later ones belong to
+    /// a future that this run left by resuming from an earlier one.
     fn remove_others(&self, newest: u64) -> Result<(), CheckpointError> {
         let mut sound = BTreeSet::from([newest]);
         for place in self.places()? {
             if place.path == checkpoint_directory(&self.directory, newest) {
                 continue;
             }
-            let superfluous = place.flights >= newest || sound.len() >= self.keep || sound.contains(&place.flights);
+            let superfluous = place.episodes >= newest
+                || sound.len() >= self.keep
+                || sound.contains(&place.episodes);
             if superfluous {
                 self.retire(&place.path)?;
                 continue;
             }
             if is_sound(&place.path) {
-                sound.insert(place.flights);
+                sound.insert(place.episodes);
             }
         }
         Ok(())
     }
 
-    /// Removes a checkpoint, if it is there; half removed, it is not taken for one.
+    /// Removes a checkpoint, if it exists. A half-removed one cannot be mistaken for a checkpoint.
     fn retire(&self, place: &Path) -> Result<(), CheckpointError> {
         if !place.exists() {
             return Ok(());
@@ -265,12 +335,12 @@ impl CheckpointStore {
         let aside = self.directory.join(".removing");
         remove(&aside)?;
         fs::rename(place, &aside).map_err(CheckpointError::io("rename", place))?;
-        pass(FaultPoint::CheckpointRetired);
+        die_if_armed(FaultPoint::CheckpointRetired);
         remove(&aside)
     }
 }
 
-/// Whether there is a checkpoint at `place` all of whose files are what was written.
+/// `true` if there is a checkpoint at `place` whose files are all as they were written.
 fn is_sound(place: &Path) -> bool {
     match Manifest::read(place).and_then(|manifest| manifest.verify(place)) {
         Ok(()) => true,
@@ -283,7 +353,7 @@ fn is_sound(place: &Path) -> bool {
     }
 }
 
-/// The name of the checkpoint at `place` while it is replaced.
+/// Name of the checkpoint at `place` while it is being replaced.
 fn replaced(place: &Path) -> PathBuf {
     let mut name = place.as_os_str().to_owned();
     name.push(REPLACED);
@@ -292,24 +362,27 @@ fn replaced(place: &Path) -> PathBuf {
 
 fn remove(path: &Path) -> Result<(), CheckpointError> {
     let removed = match fs::remove_dir_all(path) {
-        // Somebody put a file where only directories of ours are.
+        // A foreign file under one of our names is removed too.
         Err(error) if error.kind() == std::io::ErrorKind::NotADirectory => fs::remove_file(path),
         removed => removed,
     };
     match removed {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(CheckpointError::io("remove", path)(error)),
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
+            Err(CheckpointError::io("remove", path)(error))
+        }
         _ => Ok(()),
     }
 }
 
-/// Brings to disk what others wrote. Whatever this fails of may be lost, and trying again may succeed without bringing it back: so not even a full disk
-/// is waited for.
+/// Syncs to disk a file that others wrote. After a failure the content may be lost, and a second
+/// attempt may succeed without writing it. So this does not wait even for a full disk.
 fn sync_once(path: &Path) -> Result<(), CheckpointError> {
-    durable::sync(path)
-        .map_err(|error| CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string())))
+    durable::sync(path).map_err(|error| {
+        CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string()))
+    })
 }
 
-/// Brings a file or directory to disk.
+/// Syncs a file or directory to disk.
 fn sync(path: &Path) -> Result<(), CheckpointError> {
     durable::sync(path).map_err(CheckpointError::io("write to disk", path))
 }

@@ -1,4 +1,4 @@
-//! What is saved is what is loaded, bit for bit, or it is refused.
+//! A loaded checkpoint equals the saved one bit for bit, or it is refused.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -11,20 +11,21 @@ use skein_protocol::transition::Outcome;
 
 use super::*;
 use crate::disk::Disk;
-use crate::flight::samples::{flight, with_images};
-use crate::metrics::{EventFile, Windows};
+use crate::episode::samples::{episode, with_images};
+use crate::metrics::{EpisodeWindows, EventFile};
 use crate::replay::Replay;
 use crate::state::TensorValues;
 
-/// With bit patterns that only survive a copy: a negative zero, the smallest number, a NaN with a payload.
-fn state(flights: u64) -> CheckpointState {
+/// A state with bit patterns that only a copy preserves: negative zero, the smallest number, a NaN
+/// with a payload.
+fn state(episodes: u64) -> CheckpointState {
     let mut replay = Replay::new(&Config::default());
     for number in 0..4 {
-        let mut flight = with_images(flight(number, 3, Outcome::Collided));
-        flight.level_up[1] = true;
-        replay.insert(flight).unwrap();
+        let mut episode = with_images(episode(number, 3, Outcome::Collided));
+        episode.level_up[1] = true;
+        replay.insert(episode).unwrap();
     }
-    let mut windows = Windows::new(50);
+    let mut windows = EpisodeWindows::new(50);
     windows.walls_passed.push(3.0);
     let odd = vec![
         -0.0,
@@ -40,46 +41,47 @@ fn state(flights: u64) -> CheckpointState {
         values,
     };
     CheckpointState {
-        progress: Progress {
-            flights,
+        progress: TrainingProgress {
+            episodes,
             epochs: 7,
             version: 9,
             policy_sha256: "0123".into(),
             environment_steps: 12,
             vae_steps: 3,
             policy_updates: u64::MAX,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,
-                keep: Keep::Depth,
+                keep: KeptData::Depth,
             }],
             evaluations: 1,
-            evaluation_flights: 5,
+            evaluation_episodes: 5,
             latest_candidate: Some(5),
             best: Some(BestSnapshot {
                 policy_version: 6,
-                flights: 60,
+                episodes: 60,
                 window_walls_passed: 0.1,
                 confirmed_walls_passed: 2.5,
             }),
             trained: Some(skein_protocol::summary::Trained {
                 rate: 0.92,
-                flights: 60,
+                confirmation_episodes: 20,
+                episodes: 60,
                 steps: 11,
                 updates: 2,
                 wall_secs: 0.5,
             }),
             metrics: MetricsState {
-                flights,
-                flights_extent: crate::metrics::FlightsExtent::empty(),
+                episodes,
+                episodes_extent: crate::metrics::EpisodesExtent::empty(),
                 events: vec![EventFile {
                     name: "events.out.tfevents.1.skein.000000".into(),
                     bytes: 77,
                 }],
                 windows,
             },
-            spent: Spent::default(),
+            spent: RunCosts::default(),
         },
         snapshots: vec![
             Snapshot {
@@ -92,7 +94,11 @@ fn state(flights: u64) -> CheckpointState {
             },
         ],
         tensors: vec![
-            tensor("adam.steps", &[1], TensorValues::I64(vec![-9_007_199_254_740_993])),
+            tensor(
+                "adam.steps",
+                &[1],
+                TensorValues::I64(vec![-9_007_199_254_740_993]),
+            ),
             tensor("log_alpha", &[], TensorValues::F64(vec![-1.0 / 3.0])),
             tensor("policy", &[2, 3], TensorValues::F32(odd)),
         ],
@@ -100,19 +106,25 @@ fn state(flights: u64) -> CheckpointState {
     }
 }
 
-/// Bits instead of numbers, because a NaN equals nothing.
+/// Compares bits instead of numbers, because NaN equals nothing.
 fn bits(state: &CheckpointState) -> Vec<(String, Vec<u64>)> {
     let bits = |values: &TensorValues| match values {
         TensorValues::F32(values) => values.iter().map(|value| value.to_bits().into()).collect(),
         TensorValues::F64(values) => values.iter().map(|value| value.to_bits()).collect(),
         TensorValues::I64(values) => values.iter().map(|value| value.cast_unsigned()).collect(),
     };
-    let tensors = state
-        .tensors
-        .iter()
-        .map(|tensor| (format!("{} {:?}", tensor.name, tensor.shape), bits(&tensor.values)));
+    let tensors = state.tensors.iter().map(|tensor| {
+        (
+            format!("{} {:?}", tensor.name, tensor.shape),
+            bits(&tensor.values),
+        )
+    });
     let snapshots = state.snapshots.iter().map(|snapshot| {
-        let bits = snapshot.values.iter().map(|value| value.to_bits().into()).collect();
+        let bits = snapshot
+            .values
+            .iter()
+            .map(|value| value.to_bits().into())
+            .collect();
         (format!("snapshot {}", snapshot.version), bits)
     });
     tensors.chain(snapshots).collect()
@@ -140,7 +152,7 @@ fn writer(store: CheckpointStore) -> CheckpointWriter {
     CheckpointWriter::start(store, Disk::new(Arc::default())).unwrap()
 }
 
-/// Every file of a checkpoint.
+/// Names of all files of a checkpoint.
 fn all_files() -> impl Iterator<Item = &'static str> {
     files::NAMES.into_iter().chain([manifest::NAME])
 }
@@ -155,11 +167,14 @@ fn names(directory: &std::path::Path) -> Vec<String> {
 }
 
 #[test]
-fn what_is_saved_is_what_is_loaded() {
+fn a_loaded_checkpoint_equals_the_saved_one() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
 }
 
 #[test]
@@ -208,10 +223,16 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
         let sound = fs::read(&path).unwrap();
         let refused = |bytes: &[u8], what: String| {
             fs::write(&path, bytes).unwrap();
-            let error = store.load(500).expect_err(&format!("{name}, {what}")).to_string();
-            assert!(error.contains(path.to_str().unwrap()), "{name}, {what}: {error}");
+            let error = store
+                .load(500)
+                .expect_err(&format!("{name}, {what}"))
+                .to_string();
+            assert!(
+                error.contains(path.to_str().unwrap()),
+                "{name}, {what}: {error}"
+            );
         };
-        // A thousand and more positions, of a file that has so many bits.
+        // At a thousand positions or more, if the file has so many bits.
         for bit in (0..8 * sound.len()).step_by((8 * sound.len() / 1000).max(1)) {
             let mut damaged = sound.clone();
             damaged[bit / 8] ^= 1 << (bit % 8);
@@ -227,7 +248,10 @@ fn a_damaged_byte_anywhere_is_refused_and_its_file_named() {
         longer.push(b'\n');
         refused(&longer, "a byte more".to_owned());
         fs::remove_file(&path).unwrap();
-        let error = store.load(500).expect_err(&format!("{name} missing")).to_string();
+        let error = store
+            .load(500)
+            .expect_err(&format!("{name} missing"))
+            .to_string();
         assert!(error.contains(name), "{error}");
         fs::write(&path, &sound).unwrap();
     }
@@ -241,11 +265,57 @@ fn another_configuration_is_refused_by_key_with_both_values() {
     let mut config = config(2);
     config.sac.discount = 0.5;
     let other = CheckpointStore::new(store.directory(), &config);
-    let error = other.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
-    for part in ["flight-500", "sac.discount = 0.99 there, 0.5 here"] {
+    let error = other
+        .load_newest(|_| Ok(()), |_| {})
+        .unwrap_err()
+        .to_string();
+    for part in ["episode-500", "sac.discount = 0.99 there, 0.5 here"] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
     assert!(!error.contains("batch_size"), "{error}");
+}
+
+#[test]
+fn a_lengthened_run_resumes_from_before_the_end_of_the_shorter_one() {
+    let (_directory, short) = store(2);
+    let mut longer = config(2);
+    (longer.run.episodes, longer.learning.episodes_per_epoch) = (500, 10);
+    let short = CheckpointStore::new(short.directory(), &longer);
+    for episodes in [400, 500] {
+        let mut state = state(episodes);
+        state.progress.epochs = episodes / 10;
+        short.save(&state, &[]).unwrap();
+    }
+    longer.run.episodes = 1000;
+    let store = CheckpointStore::new(short.directory(), &longer);
+    let mut passed_over = Vec::new();
+    let found = store
+        .load_newest(|_| Ok(()), |error| passed_over.push(error.to_string()))
+        .unwrap()
+        .unwrap();
+    assert_eq!(found.progress.episodes, 400);
+    assert!(
+        passed_over[0].contains("end of the run of 500 episodes"),
+        "{passed_over:?}"
+    );
+    // A shorter run, or one that differs in anything else, refuses it.
+    let shorter = |config: &mut Config| config.run.episodes = 499;
+    let other_seed = |config: &mut Config| {
+        (config.run.episodes, config.run.seed) = (1000, 99);
+    };
+    let changes: [fn(&mut Config); 2] = [shorter, other_seed];
+    for change in changes {
+        let mut other = config(2);
+        other.learning.episodes_per_epoch = 10;
+        change(&mut other);
+        let refused = CheckpointStore::new(short.directory(), &other)
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap_err();
+        assert!(
+            matches!(refused, CheckpointError::Configuration { .. }),
+            "{refused}"
+        );
+    }
 }
 
 #[test]
@@ -255,28 +325,38 @@ fn another_format_is_refused_before_anything_else_is_believed() {
     let path = store.save(&state(500), &[]).unwrap().join(manifest::NAME);
     let body = "{\n  \"format\": 9,\n  \"something\": \"new\"";
     let checksum = xxhash_rust::xxh3::xxh3_64(body.as_bytes());
-    fs::write(&path, format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n")).unwrap();
-    // It is no damage that an older checkpoint could make good.
+    fs::write(
+        &path,
+        format!("{body},\n  \"xxh3\": \"{checksum:016x}\"\n}}\n"),
+    )
+    .unwrap();
+    // An older checkpoint could not help: nothing is damaged.
     let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err();
     let expected = manifest::FORMAT;
     assert!(
-        matches!(error, CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected),
+        matches!(
+            error,
+            CheckpointError::Format { found: 9, expected: ours, .. } if ours == expected
+        ),
         "{error}"
     );
 }
 
 #[test]
-fn a_run_whose_checkpoints_are_all_damaged_is_not_begun_anew() {
+fn a_run_whose_checkpoints_are_all_damaged_is_not_started_again() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000] {
-        let place = store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000] {
+        let place = store.save(&state(episodes), &[]).unwrap();
         fs::write(place.join("progress.bin"), "").unwrap();
     }
-    let error = store.load_newest(|_| Ok(()), |_| {}).unwrap_err().to_string();
+    let error = store
+        .load_newest(|_| Ok(()), |_| {})
+        .unwrap_err()
+        .to_string();
     for part in [
         "none of the 2 checkpoints",
-        "flight-1000/progress.bin",
-        "remove that folder and flights.csv",
+        "episode-1000/progress.bin",
+        "remove that folder and episodes.csv",
     ] {
         assert!(error.contains(part), "`{error}` does not mention `{part}`");
     }
@@ -296,59 +376,76 @@ fn nobody_else_can_read_a_checkpoint() {
 #[test]
 fn only_the_newest_few_are_kept_and_nothing_else_remains() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000, 1500] {
-        store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000, 1500] {
+        store.save(&state(episodes), &[]).unwrap();
     }
-    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500"]);
+    assert_eq!(names(store.directory()), ["episode-1000", "episode-1500"]);
     assert_eq!(store.list().unwrap(), [1500, 1000]);
 }
 
 #[test]
 fn a_damaged_checkpoint_does_not_count_among_those_kept() {
     let (_directory, store) = store(2);
-    for flights in [500, 1000] {
-        store.save(&state(flights), &[]).unwrap();
+    for episodes in [500, 1000] {
+        store.save(&state(episodes), &[]).unwrap();
     }
-    fs::write(store.directory().join("flight-1000/progress.bin"), "").unwrap();
+    fs::write(store.directory().join("episode-1000/progress.bin"), "").unwrap();
     store.save(&state(1500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-1000", "flight-1500", "flight-500"]);
+    assert_eq!(
+        names(store.directory()),
+        ["episode-1000", "episode-1500", "episode-500"]
+    );
     store.save(&state(2000), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-1500", "flight-2000"]);
+    assert_eq!(names(store.directory()), ["episode-1500", "episode-2000"]);
 }
 
 #[test]
 fn a_checkpoint_that_is_written_again_is_never_missed() {
     let (_directory, store) = store(1);
     let place = store.save(&state(500), &[]).unwrap();
-    // The first half of the exchange, then a death.
-    let replaced = store.directory().join("flight-500.replaced");
+    // The first half of the exchange, then the process is killed.
+    let replaced = store.directory().join("episode-500.replaced");
     fs::rename(&place, &replaced).unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
     assert_eq!(store.list().unwrap(), [500]);
     // The second half, then damage to the new one.
     let place = store.save(&state(500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
     fs::rename(&place, &replaced).unwrap();
     fs::create_dir(&place).unwrap();
     fs::write(place.join("progress.bin"), "").unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(500));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(500),
+    );
     store.save(&state(500), &[]).unwrap();
     assert_same(&store.load(500).unwrap(), &state(500));
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
 }
 
 #[test]
-fn a_damaged_newest_is_passed_over_and_replaced_when_its_flight_is_reached_again() {
+fn a_damaged_newest_is_passed_over_and_replaced_when_its_episode_is_reached_again() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     let newest = store.save(&state(1000), &[]).unwrap();
     fs::write(newest.join("progress.bin"), "").unwrap();
     assert_eq!(
-        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        store
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap()
+            .unwrap()
+            .progress
+            .episodes,
         500
     );
     store.save(&state(1000), &[]).unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(1000));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(1000),
+    );
 }
 
 #[test]
@@ -356,18 +453,18 @@ fn checkpoints_of_an_abandoned_future_do_not_push_out_the_present() {
     let (_directory, store) = store(1);
     store.save(&state(1000), &[]).unwrap();
     store.save(&state(600), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-600"]);
+    assert_eq!(names(store.directory()), ["episode-600"]);
 }
 
 #[test]
-fn what_an_interrupted_write_left_is_never_read_and_then_cleared() {
+fn leftovers_of_an_interrupted_write_are_never_read_and_then_removed() {
     let (_directory, store) = store(2);
     let interrupted = store.save(&state(437), &[]).unwrap();
     fs::write(interrupted.join("tensors.safetensors.part"), "half").unwrap();
     fs::rename(interrupted, store.directory().join(".writing")).unwrap();
     assert!(store.load_newest(|_| Ok(()), |_| {}).unwrap().is_none());
     let place = store.save(&state(500), &[]).unwrap();
-    assert_eq!(names(store.directory()), ["flight-500"]);
+    assert_eq!(names(store.directory()), ["episode-500"]);
     assert_eq!(
         names(&place),
         [
@@ -391,17 +488,17 @@ fn a_run_without_checkpoints_has_none() {
 fn the_writing_thread_has_everything_on_disk_when_it_is_finished() {
     let (_directory, store) = store(3);
     let mut writer = writer(store.clone());
-    for flights in [500, 1000] {
-        writer.save(state(flights), Vec::new()).unwrap();
+    for episodes in [500, 1000] {
+        writer.save(state(episodes), Vec::new()).unwrap();
     }
     writer.finish().unwrap();
-    for flights in [500, 1000] {
-        assert_same(&store.load(flights).unwrap(), &state(flights));
+    for episodes in [500, 1000] {
+        assert_same(&store.load(episodes).unwrap(), &state(episodes));
     }
 }
 
 #[test]
-fn a_failed_write_is_told_by_the_next_save_or_the_end() {
+fn a_failed_write_is_returned_by_the_next_save_or_the_end() {
     let directory = tempfile::tempdir().unwrap();
     let in_the_way = directory.path().join("checkpoints");
     fs::write(&in_the_way, "a file, not a folder").unwrap();
@@ -414,14 +511,19 @@ fn a_failed_write_is_told_by_the_next_save_or_the_end() {
 
     let mut writer = start();
     writer.save(state(500), Vec::new()).unwrap();
-    assert!(matches!(writer.finish().unwrap_err(), CheckpointError::Io { .. }));
+    assert!(matches!(
+        writer.finish().unwrap_err(),
+        CheckpointError::Io { .. }
+    ));
 }
 
 #[test]
-fn what_a_checkpoint_relies_on_must_be_there() {
+fn files_that_a_checkpoint_relies_on_must_exist() {
     let (directory, store) = store(2);
-    let rows = directory.path().join("flights.csv");
-    store.save(&state(500), std::slice::from_ref(&rows)).unwrap_err();
+    let rows = directory.path().join("episodes.csv");
+    store
+        .save(&state(500), std::slice::from_ref(&rows))
+        .unwrap_err();
     assert!(store.list().unwrap().is_empty());
     fs::write(&rows, "").unwrap();
     store.save(&state(500), &[rows]).unwrap();
@@ -448,12 +550,14 @@ impl SmallDisk {
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
-        let _ = std::process::Command::new("umount").arg(self.0.path()).status();
+        let _ = std::process::Command::new("umount")
+            .arg(self.0.path())
+            .status();
     }
 }
 
 #[test]
-fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop() {
+fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_stopped() {
     let Some(small) = SmallDisk::mount() else {
         println!("skipped: no file system can be mounted here");
         return;
@@ -470,12 +574,20 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     writer.save(state(600), Vec::new()).unwrap();
     wait_for(|| disk.waiting().is_some());
     assert_eq!(
-        store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap().progress.flights,
+        store
+            .load_newest(|_| Ok(()), |_| {})
+            .unwrap()
+            .unwrap()
+            .progress
+            .episodes,
         500
     );
     fs::remove_file(&ballast).unwrap();
     writer.finish().unwrap();
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(600),
+    );
 
     free(&ballast);
     let mut writer = CheckpointWriter::start(store.clone(), disk.clone()).unwrap();
@@ -484,7 +596,10 @@ fn a_full_disk_pauses_the_writing_until_there_is_room_or_the_run_is_told_to_stop
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     let error = writer.finish().unwrap_err().to_string();
     assert!(error.contains("No space left on device"), "{error}");
-    assert_same(&store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(), &state(600));
+    assert_same(
+        &store.load_newest(|_| Ok(()), |_| {}).unwrap().unwrap(),
+        &state(600),
+    );
 }
 
 fn wait_for(condition: impl Fn() -> bool) {
@@ -496,35 +611,37 @@ fn wait_for(condition: impl Fn() -> bool) {
 }
 
 #[test]
-fn one_that_does_not_fit_what_lies_beside_it_is_passed_over_and_told() {
+fn a_checkpoint_that_does_not_fit_the_files_beside_it_is_passed_over_and_reported() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
     store.save(&state(1000), &[]).unwrap();
-    let check = |state: &CheckpointState| match state.progress.flights {
+    let check = |state: &CheckpointState| match state.progress.episodes {
         1000 => Err(CheckpointError::Unfit {
-            flights: 1000,
-            problem: "flights.csv ends after 3 bytes".to_owned(),
+            episodes: 1000,
+            problem: "episodes.csv ends after 3 bytes".to_owned(),
         }),
         _ => Ok(()),
     };
-    let mut told = Vec::new();
-    let newest = store.load_newest(check, |error| told.push(error.to_string())).unwrap();
+    let mut reported = Vec::new();
+    let newest = store
+        .load_newest(check, |error| reported.push(error.to_string()))
+        .unwrap();
     assert_same(&newest.unwrap(), &state(500));
     assert_eq!(
-        told,
-        ["the checkpoint of flight 1000 does not fit: flights.csv ends after 3 bytes"]
+        reported,
+        ["the checkpoint of episode 1000 does not fit: episodes.csv ends after 3 bytes"]
     );
 }
 
 #[test]
-fn files_among_the_checkpoints_are_in_nobodys_way() {
+fn other_files_among_the_checkpoints_do_no_harm() {
     let (_directory, store) = store(2);
     store.save(&state(500), &[]).unwrap();
-    for name in ["flight-9999", ".writing", ".removing", "notes.txt"] {
+    for name in ["episode-9999", ".writing", ".removing", "notes.txt"] {
         fs::write(store.directory().join(name), "").unwrap();
     }
     store.save(&state(1000), &[]).unwrap();
     store.save(&state(1500), &[]).unwrap();
     assert_eq!(store.list().unwrap(), [1500, 1000]);
-    assert!(store.directory().join("flight-9999").exists());
+    assert!(store.directory().join("episode-9999").exists());
 }

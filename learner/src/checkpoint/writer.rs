@@ -1,4 +1,4 @@
-//! Writes checkpoints on a thread of its own, so that learning does not wait for the disk.
+//! Writes checkpoints on a separate thread, so that learning does not wait for the disk.
 
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -11,18 +11,19 @@ use crate::disk::Disk;
 
 /// Hands states to the writing thread.
 ///
-/// At most one state is written at a time and none queues: handing over the next one waits until the thread is free, so never more than two are in memory.
+/// At most one state is written at a time, and none queues: handing over the next one waits until
+/// the thread is free. So there are never more than two in memory.
 #[derive(Debug)]
 pub struct CheckpointWriter {
     store: CheckpointStore,
-    orders: SyncSender<Order>,
-    /// Ends with the first error; taken when that is handed out.
+    orders: SyncSender<WriteOrder>,
+    /// Ends with the first error; taken when that error is returned.
     thread: Option<JoinHandle<Result<(), CheckpointError>>>,
 }
 
-/// A state to be written, and the files outside that it counts on.
+/// A state to write, and the other files that it relies on.
 #[derive(Debug)]
-struct Order {
+struct WriteOrder {
     state: CheckpointState,
     relied_on: Vec<PathBuf>,
 }
@@ -38,7 +39,10 @@ impl CheckpointWriter {
         let thread = thread::Builder::new()
             .name("checkpoints".to_owned())
             .spawn(move || write_all(&for_thread, &disk, &receiver))
-            .map_err(CheckpointError::io("start a thread that writes to", store.directory()))?;
+            .map_err(CheckpointError::io(
+                "start a thread that writes to",
+                store.directory(),
+            ))?;
         Ok(Self {
             store,
             orders,
@@ -46,22 +50,26 @@ impl CheckpointWriter {
         })
     }
 
-    /// Hands over a state to be written, and the files that it counts on: see [`CheckpointStore::save`].
+    /// Hands over a state to write, and the files that it relies on: see [`CheckpointStore::save`].
     ///
     /// # Errors
-    /// What went wrong with an earlier one. The thread has ended then; whoever wants to go on writing starts another.
-    pub fn save(&mut self, state: CheckpointState, relied_on: Vec<PathBuf>) -> Result<(), CheckpointError> {
+    /// The error of an earlier write. The thread has ended then; writing again needs a new one.
+    pub fn save(
+        &mut self,
+        state: CheckpointState,
+        relied_on: Vec<PathBuf>,
+    ) -> Result<(), CheckpointError> {
         self.orders
-            .send(Order { state, relied_on })
+            .send(WriteOrder { state, relied_on })
             .or_else(|_| self.join().and_then(|()| Err(self.gone())))
     }
 
     /// Waits until everything handed over is on disk.
     ///
     /// # Errors
-    /// What went wrong with it and was not told yet.
+    /// The error of a write that was not returned yet.
     pub fn finish(mut self) -> Result<(), CheckpointError> {
-        // The thread ends when nobody can hand it anything any more.
+        // The thread ends when nothing can be handed over any longer.
         self.orders = sync_channel(0).0;
         self.join()
     }
@@ -78,11 +86,19 @@ impl CheckpointWriter {
     }
 }
 
-fn write_all(store: &CheckpointStore, disk: &Disk, orders: &Receiver<Order>) -> Result<(), CheckpointError> {
-    for Order { state, relied_on } in orders {
+fn write_all(
+    store: &CheckpointStore,
+    disk: &Disk,
+    orders: &Receiver<WriteOrder>,
+) -> Result<(), CheckpointError> {
+    for WriteOrder { state, relied_on } in orders {
         let started = std::time::Instant::now();
         let path = disk.with_room(store.directory(), || store.save(&state, &relied_on))?;
-        info!(path = %path.display(), secs = started.elapsed().as_secs_f64(), "checkpoint written");
+        info!(
+            path = %path.display(),
+            secs = started.elapsed().as_secs_f64(),
+            "checkpoint written"
+        );
     }
     Ok(())
 }

@@ -1,9 +1,8 @@
 //! TensorBoard event files.
 //!
-//! An event file is a sequence of framed protocol buffer messages. The two crates that write them are built on protocol buffer libraries long
-//! superseded, so the few messages we need stand here. Field numbers are those of TensorFlow's `event.proto` and `summary.proto`; the frame is
-//! `length u64 | masked CRC of length u32 | message | masked CRC of message u32`, little-endian, where the CRC is CRC-32C and masking rotates
-//! it and adds a constant, so that the checksum of data that itself holds checksums stays a good one (TensorFlow's `record_writer.h`).
+//! An event file is a sequence of framed protocol buffer messages. The two crates that write them
+//! depend on superseded protocol buffer libraries, so the few messages needed are defined here.
+//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -12,57 +11,68 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use prost::Message;
 use serde::{Deserialize, Serialize};
+use skein_run::write_event_record;
 
-use crate::disk::{Disk, Patient};
-use crate::report::tell;
+use crate::disk::{Disk, PatientWriter};
+use crate::notice::notify_user;
 
-/// How the names of our files begin, before the second of their start. TensorBoard takes files whose name has `tfevents` in it.
+/// Start of our files' names, before the second of their creation. TensorBoard reads files whose
+/// name contains `tfevents`.
 const NAME: &str = "events.out.tfevents.";
 
-/// Appends scalars to an event file of its own.
+/// Appends scalars to a new event file.
 #[derive(Debug)]
 pub struct EventWriter {
-    /// Files of earlier lives, then the present one.
+    /// Files of earlier incarnations, then the present one.
     files: Vec<EventFile>,
     path: PathBuf,
-    file: BufWriter<Patient<File>>,
+    file: BufWriter<PatientWriter<File>>,
 }
 
 /// An event file, as far as it belongs to the run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EventFile {
-    /// Its name in the folder.
+    /// Name in the folder.
     pub name: String,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
 }
 
-/// Why events cannot be written.
+/// Reason why events cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot write TensorBoard events to {}: {source}", path.display())]
 pub struct EventError {
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Why.
+    /// Cause.
     #[source]
     pub source: io::Error,
 }
 
 impl EventWriter {
-    /// Starts a new event file in `directory`, after cutting back those there are to `files`: what lies beyond is of flights whose learning was lost.
-    /// TensorBoard reads all files of a directory as one; of earlier ones it drops what lies at `first_step` or later.
+    /// Starts a new event file in `directory`, after cutting existing ones back to `files`: later
+    /// content belongs to episodes whose learning was lost. TensorBoard reads all files of a
+    /// directory as one, and drops points of earlier files at `first_step` or later.
     ///
-    /// A file that has lost a part of `files`, or all of it, is named in a warning: its curves then have a hole, which is no reason not to train.
+    /// A file that has lost a part of `files` causes a warning with its name. Its curves then have
+    /// a hole, but training continues.
     ///
     /// # Errors
     /// [`EventError`] when a file cannot be cut back or created.
-    pub fn resume(directory: &Path, files: Vec<EventFile>, first_step: u64, disk: &Disk) -> Result<Self, EventError> {
+    pub fn resume(
+        directory: &Path,
+        files: Vec<EventFile>,
+        first_step: u64,
+        disk: &Disk,
+    ) -> Result<Self, EventError> {
         let at = |path: PathBuf| move |source| EventError { path, source };
         fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
-        let (files, others): (Vec<_>, Vec<_>) = files.into_iter().partition(|file| Begun::of(&file.name).is_some());
-        // Whatever a damaged list names elsewhere is not for us to cut.
+        let (files, others): (Vec<_>, Vec<_>) = files
+            .into_iter()
+            .partition(|file| CreationStamp::of(&file.name).is_some());
+        // A damaged list may name other files; those are not cut.
         for EventFile { name, .. } in others {
-            tracing::warn!(name, "not the name of an event file of ours: left alone");
+            tracing::warn!(name, "not the name of one of our event files: left alone");
         }
         let (path, file) = begin(directory, cut_back(directory, &files)?);
         let file = BufWriter::new(disk.patient(&path, file.map_err(at(path.clone()))?));
@@ -76,20 +86,26 @@ impl EventWriter {
                 .into_owned(),
             bytes: 0,
         });
-        writer.write(first_step, event::What::FileVersion("brain.Event:2".to_owned()))?;
         writer.write(
             first_step,
-            event::What::SessionLog(SessionLog { status: SESSION_START }),
+            event::What::FileVersion("brain.Event:2".to_owned()),
+        )?;
+        writer.write(
+            first_step,
+            event::What::SessionLog(SessionLog {
+                status: SESSION_START,
+            }),
         )?;
         Ok(writer)
     }
 
-    /// All files of the run, as far as they were written; what is not [flushed](EventWriter::flush) yet is counted in.
+    /// All files of the run with their lengths, which include what is not
+    /// [flushed](EventWriter::flush) yet.
     pub fn files(&self) -> &[EventFile] {
         &self.files
     }
 
-    /// Appends one value for each tag at `step`.
+    /// Appends one value per tag at `step`.
     ///
     /// # Errors
     /// [`EventError`].
@@ -121,10 +137,13 @@ impl EventWriter {
             step: step.cast_signed(),
             what: Some(what),
         };
-        let bytes = write_record(&mut self.file, &event.encode_to_vec()).map_err(|source| EventError {
-            path: self.path.clone(),
-            source,
-        })?;
+        let bytes =
+            write_event_record(&mut self.file, &event.encode_to_vec()).map_err(|source| {
+                EventError {
+                    path: self.path.clone(),
+                    source,
+                }
+            })?;
         if let Some(present) = self.files.last_mut() {
             present.bytes += bytes;
         }
@@ -132,39 +151,48 @@ impl EventWriter {
     }
 }
 
-/// Creates a file in `directory` that comes after the one begun `latest`, even if the clock has gone back since: TensorBoard takes files in alphabetical
-/// order. A second start within one second is told apart by the number.
-fn begin(directory: &Path, latest: Option<Begun>) -> (PathBuf, io::Result<File>) {
+/// Creates a file in `directory` whose name sorts after the one created at `latest`, even if the
+/// clock has gone back. TensorBoard reads files in alphabetical order. The number distinguishes
+/// files created within one second.
+fn begin(directory: &Path, latest: Option<CreationStamp>) -> (PathBuf, io::Result<File>) {
     let now = now_secs() as u64;
     let first = match latest {
-        Some(latest) if latest.second >= now => Begun {
+        Some(latest) if latest.second >= now => CreationStamp {
             number: latest.number.saturating_add(1),
             ..latest
         },
-        _ => Begun { second: now, number: 0 },
+        _ => CreationStamp {
+            second: now,
+            number: 0,
+        },
     };
     (first.number..first.number.saturating_add(1000))
-        .map(|number| directory.join(Begun { number, ..first }.name()))
+        .map(|number| directory.join(CreationStamp { number, ..first }.name()))
         .find_map(|path| match File::create_new(&path) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => None,
             result => Some((path, result)),
         })
-        .unwrap_or_else(|| (directory.to_owned(), Err(io::ErrorKind::AlreadyExists.into())))
+        .unwrap_or_else(|| {
+            (
+                directory.to_owned(),
+                Err(io::ErrorKind::AlreadyExists.into()),
+            )
+        })
 }
 
-/// When an event file of ours was begun; what its name says.
+/// Creation time of one of our event files, as in its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Begun {
+struct CreationStamp {
     second: u64,
     number: u32,
 }
 
-impl Begun {
+impl CreationStamp {
     fn name(self) -> String {
         format!("{NAME}{}.skein.{:06}", self.second, self.number)
     }
 
-    /// `None` of a file that is not ours.
+    /// Parses a file name; `None` if the file is not ours.
     fn of(name: &str) -> Option<Self> {
         let (second, number) = name.strip_prefix(NAME)?.split_once(".skein.")?;
         Some(Self {
@@ -174,8 +202,9 @@ impl Begun {
     }
 }
 
-/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns when the latest of `files` was begun.
-fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, EventError> {
+/// Cuts our files in `directory` back to `files` and removes all others of ours. Returns the
+/// creation time of the latest of `files`.
+fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<CreationStamp>, EventError> {
     let at = |path: &Path| {
         let path = path.to_owned();
         move |source| EventError { path, source }
@@ -183,7 +212,7 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
     for entry in fs::read_dir(directory).map_err(at(directory))? {
         let name = entry.map_err(at(directory))?.file_name();
         let known = |file: &EventFile| name == file.name.as_str();
-        if name.to_str().and_then(Begun::of).is_some() && !files.iter().any(known) {
+        if name.to_str().and_then(CreationStamp::of).is_some() && !files.iter().any(known) {
             let path = directory.join(&name);
             fs::remove_file(&path).map_err(at(&path))?;
         }
@@ -193,35 +222,27 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<Begun>, Even
         let found = fs::metadata(&path).map_or(0, |metadata| metadata.len());
         if found < *bytes {
             let path = path.display();
-            tell(&format!(
+            notify_user(&format!(
                 "{path} ends after {found} of {bytes} bytes: TensorBoard's curves have a hole"
             ));
         } else if found > *bytes {
-            let file = OpenOptions::new().write(true).open(&path).map_err(at(&path))?;
+            let file = OpenOptions::new()
+                .write(true)
+                .open(&path)
+                .map_err(at(&path))?;
             file.set_len(*bytes).map_err(at(&path))?;
         }
     }
-    Ok(files.iter().filter_map(|file| Begun::of(&file.name)).max())
+    Ok(files
+        .iter()
+        .filter_map(|file| CreationStamp::of(&file.name))
+        .max())
 }
 
 fn now_secs() -> f64 {
     SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0.0, |elapsed| elapsed.as_secs_f64())
-}
-
-/// Writes one record; returns its length.
-fn write_record(into: &mut impl Write, message: &[u8]) -> io::Result<u64> {
-    let length = (message.len() as u64).to_le_bytes();
-    into.write_all(&length)?;
-    into.write_all(&masked_crc(&length).to_le_bytes())?;
-    into.write_all(message)?;
-    into.write_all(&masked_crc(message).to_le_bytes())?;
-    Ok(8 + 4 + message.len() as u64 + 4)
-}
-
-fn masked_crc(bytes: &[u8]) -> u32 {
-    crc32c::crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 
 #[derive(Clone, PartialEq, Message)]
@@ -267,30 +288,21 @@ struct SessionLog {
     status: i32,
 }
 
-/// `SessionLog.SessionStatus.START`.
+/// Value of `SessionLog.SessionStatus.START`.
 const SESSION_START: i32 = 1;
 
-/// Reading back what was written.
+/// Reads back what was written.
 #[cfg(test)]
 pub(super) mod testing {
+    use skein_run::split_event_record;
+
     use super::*;
 
     /// Reads records back, checking every length and checksum.
     pub(in super::super::events) fn read_records(mut bytes: &[u8]) -> Result<Vec<Event>, String> {
         let mut events = Vec::new();
         while !bytes.is_empty() {
-            let (length, rest) = bytes.split_first_chunk::<8>().ok_or("length cut short")?;
-            let (length_crc, rest) = rest.split_first_chunk::<4>().ok_or("checksum cut short")?;
-            if masked_crc(length) != u32::from_le_bytes(*length_crc) {
-                return Err("length damaged".to_owned());
-            }
-            let (message, rest) = rest
-                .split_at_checked(u64::from_le_bytes(*length) as usize)
-                .ok_or("message cut short")?;
-            let (crc, rest) = rest.split_first_chunk::<4>().ok_or("checksum cut short")?;
-            if masked_crc(message) != u32::from_le_bytes(*crc) {
-                return Err("message damaged".to_owned());
-            }
+            let (message, rest) = split_event_record(bytes).map_err(|error| error.to_string())?;
             events.push(Event::decode(message).map_err(|error| error.to_string())?);
             bytes = rest;
         }
@@ -321,31 +333,33 @@ mod tests {
     use super::*;
 
     fn create(directory: &Path, first_step: u64) -> EventWriter {
-        EventWriter::resume(directory, Vec::new(), first_step, &Disk::new(std::sync::Arc::default())).unwrap()
+        EventWriter::resume(
+            directory,
+            Vec::new(),
+            first_step,
+            &Disk::new(std::sync::Arc::default()),
+        )
+        .unwrap()
     }
 
     fn sample_file(first_step: u64) -> Vec<u8> {
         let directory = tempfile::tempdir().unwrap();
         let mut writer = create(directory.path(), first_step);
         writer
-            .scalars(7, &[("flight/return", -1.5), ("flight/steps", 12.0)])
+            .scalars(7, &[("episode/return", -1.5), ("episode/steps", 12.0)])
             .unwrap();
-        writer.scalars(8, &[("flight/return", 0.0)]).unwrap();
+        writer.scalars(8, &[("episode/return", 0.0)]).unwrap();
         writer.flush().unwrap();
         std::fs::read(&writer.path).unwrap()
     }
 
     #[test]
-    fn masking_agrees_with_the_published_vector() {
-        // CRC-32C of 32 zero bytes is 8a9136aa (RFC 3720, B.4); rotated right by 15 bits it is 6d551522.
-        assert_eq!(crc32c::crc32c(&[0; 32]), 0x8a91_36aa);
-        assert_eq!(masked_crc(&[0; 32]), 0x6d55_1522_u32.wrapping_add(0xa282_ead8));
-    }
-
-    #[test]
-    fn what_was_written_reads_back() {
+    fn written_events_read_back() {
         let events = read_records(&sample_file(5)).unwrap();
-        let what: Vec<_> = events.iter().map(|event| event.what.clone().unwrap()).collect();
+        let what: Vec<_> = events
+            .iter()
+            .map(|event| event.what.clone().unwrap())
+            .collect();
         let value = |tag: &str, value| SummaryValue {
             tag: tag.to_owned(),
             simple_value: Some(value),
@@ -354,27 +368,22 @@ mod tests {
             what,
             [
                 event::What::FileVersion("brain.Event:2".to_owned()),
-                event::What::SessionLog(SessionLog { status: SESSION_START }),
-                event::What::Summary(Summary {
-                    value: vec![value("flight/return", -1.5), value("flight/steps", 12.0)]
+                event::What::SessionLog(SessionLog {
+                    status: SESSION_START
                 }),
                 event::What::Summary(Summary {
-                    value: vec![value("flight/return", 0.0)]
+                    value: vec![value("episode/return", -1.5), value("episode/steps", 12.0)]
+                }),
+                event::What::Summary(Summary {
+                    value: vec![value("episode/return", 0.0)]
                 }),
             ]
         );
-        assert_eq!(events.iter().map(|event| event.step).collect::<Vec<_>>(), [5, 5, 7, 8]);
+        assert_eq!(
+            events.iter().map(|event| event.step).collect::<Vec<_>>(),
+            [5, 5, 7, 8]
+        );
         assert!(events.iter().all(|event| event.wall_time > 1.7e9));
-    }
-
-    #[test]
-    fn a_damaged_byte_anywhere_is_noticed() {
-        let sound = sample_file(0);
-        for index in 0..sound.len() {
-            let mut damaged = sound.clone();
-            damaged[index] ^= 0x10;
-            assert!(read_records(&damaged).is_err(), "byte {index}");
-        }
     }
 
     #[test]
@@ -388,12 +397,14 @@ mod tests {
         };
         assert_eq!(
             file.bytes,
-            fs::metadata(directory.path().join(&file.name)).unwrap().len()
+            fs::metadata(directory.path().join(&file.name))
+                .unwrap()
+                .len()
         );
     }
 
     #[test]
-    fn a_file_elsewhere_is_left_alone_whatever_a_list_says() {
+    fn a_file_elsewhere_is_left_alone_even_if_listed() {
         let directory = tempfile::tempdir().unwrap();
         let outside = directory.path().join("outside");
         fs::write(&outside, "untouched").unwrap();
@@ -402,13 +413,15 @@ mod tests {
             bytes: 0,
         });
         let curves = directory.path().join("tensorboard");
-        let writer = EventWriter::resume(&curves, files.to_vec(), 0, &Disk::new(Default::default())).unwrap();
+        let writer =
+            EventWriter::resume(&curves, files.to_vec(), 0, &Disk::new(Default::default()))
+                .unwrap();
         assert_eq!(fs::read_to_string(outside).unwrap(), "untouched");
         assert_eq!(writer.files().len(), 1);
     }
 
     #[test]
-    fn a_later_life_has_a_file_of_a_later_name_even_when_the_clock_went_back() {
+    fn a_later_incarnation_has_a_file_of_a_later_name_even_when_the_clock_went_back() {
         let directory = tempfile::tempdir().unwrap();
         let ahead = format!("{NAME}99999999999.skein.000000");
         fs::write(directory.path().join(&ahead), "0123456789").unwrap();
@@ -416,7 +429,13 @@ mod tests {
             name: ahead.clone(),
             bytes: 4,
         }];
-        let writer = EventWriter::resume(directory.path(), known, 7, &Disk::new(std::sync::Arc::default())).unwrap();
+        let writer = EventWriter::resume(
+            directory.path(),
+            known,
+            7,
+            &Disk::new(std::sync::Arc::default()),
+        )
+        .unwrap();
         assert!(writer.files()[1].name > ahead, "{:?}", writer.files());
         assert_eq!(fs::read(directory.path().join(ahead)).unwrap(), b"0123");
     }

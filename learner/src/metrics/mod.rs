@@ -1,82 +1,90 @@
-//! What a training run tells about itself: `flights.csv`, TensorBoard curves, averages over the latest flights.
+//! Metrics of a training run: `episodes.csv`, TensorBoard curves, and averages over the latest
+//! episodes.
 //!
-//! All three are keyed by committed flight, not by time: two runs of one configuration have the same curves whatever machines flew them, and a
-//! resumed run continues where its checkpoint was taken.
+//! All three are keyed by committed episode, not by time. So two runs of one configuration have the
+//! same curves, whatever machines flew them, and a resumed run continues where its checkpoint was
+//! taken.
 
+mod episodes;
 mod events;
-mod flights;
+mod faults;
 mod scalars;
 mod window;
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use skein_protocol::run::RunDirectory;
+use skein_protocol::{REWARD_TERM_NAMES, REWARD_TERMS};
+use skein_run::RunDirectory;
 
 use crate::disk::Disk;
-use crate::flight::CommittedFlight;
+use crate::episode::CommittedEpisode;
 
+pub use episodes::{EpisodeRow, EpisodesCsv, EpisodesError, EpisodesExtent};
 pub use events::{EventError, EventFile, EventWriter};
-pub use flights::{FlightRow, FlightsCsv, FlightsError, FlightsExtent};
+pub use faults::fault_points;
 pub use scalars::Scalar;
 pub use window::MovingAverage;
 
-/// Averages over the latest training flights; part of a checkpoint.
+/// Averages over the latest training episodes; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Windows {
-    /// Of the return.
+pub struct EpisodeWindows {
+    /// Average return.
     pub total_reward: MovingAverage,
-    /// Of the walls passed; candidates for the best snapshot are chosen by it.
+    /// Average number of walls passed; decides which snapshots are candidates.
     pub walls_passed: MovingAverage,
 }
 
-impl Windows {
-    /// Empty ones over `flights` flights.
-    pub fn new(flights: usize) -> Self {
+impl EpisodeWindows {
+    /// Empty averages over `episodes` episodes.
+    pub fn new(episodes: usize) -> Self {
         Self {
-            total_reward: MovingAverage::new(flights),
-            walls_passed: MovingAverage::new(flights),
+            total_reward: MovingAverage::new(episodes),
+            walls_passed: MovingAverage::new(episodes),
         }
     }
 
-    /// Whether they are over `flights` flights, see [`MovingAverage::is_over`].
-    pub fn are_over(&self, flights: usize) -> bool {
-        self.total_reward.is_over(flights) && self.walls_passed.is_over(flights)
+    /// `true` if both averages are over `episodes` episodes, see [`MovingAverage::is_over`].
+    pub fn are_over(&self, episodes: usize) -> bool {
+        self.total_reward.is_over(episodes) && self.walls_passed.is_over(episodes)
     }
 }
 
-/// How far the metrics of a run are; part of a checkpoint.
+/// Extent of a run's metrics; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MetricsState {
-    /// Rows in `flights.csv`.
-    pub flights: u64,
-    /// What those rows are.
-    pub flights_extent: FlightsExtent,
+    /// Number of rows in `episodes.csv`.
+    pub episodes: u64,
+    /// Length and checksum of those rows.
+    pub episodes_extent: EpisodesExtent,
     /// Event files with their lengths.
     pub events: Vec<EventFile>,
-    /// Averages over the latest flights.
-    pub windows: Windows,
+    /// Averages over the latest episodes.
+    pub windows: EpisodeWindows,
 }
 
 impl MetricsState {
-    /// Of a new run, averaged over `window_flights` flights.
-    pub fn new(window_flights: usize) -> Self {
+    /// State of a new run, with averages over `window_episodes` episodes.
+    pub fn new(window_episodes: usize) -> Self {
         Self {
-            flights: 0,
-            flights_extent: FlightsExtent::empty(),
+            episodes: 0,
+            episodes_extent: EpisodesExtent::empty(),
             events: Vec::new(),
-            windows: Windows::new(window_flights),
+            windows: EpisodeWindows::new(window_episodes),
         }
     }
 }
 
 impl MetricsState {
-    /// Checks that `flights.csv` of `run` is what was written when this state was taken, or more.
+    /// Checks that `episodes.csv` of `run` begins with the content it had when this state was
+    /// taken.
     ///
     /// # Errors
-    /// [`MetricsError::Flights`] says what is wrong with it.
+    /// [`MetricsError::Episodes`] says what is wrong with the file.
     pub fn check(&self, run: &RunDirectory) -> Result<(), MetricsError> {
-        Ok(self.flights_extent.check(&run.flights_csv(), self.flights)?)
+        Ok(self
+            .episodes_extent
+            .check(&run.episodes_csv(), self.episodes)?)
     }
 }
 
@@ -85,124 +93,140 @@ impl MetricsState {
 pub struct Metrics {
     run: RunDirectory,
     rows: u64,
-    flights: FlightsCsv,
+    episodes: EpisodesCsv,
     events: EventWriter,
-    windows: Windows,
+    windows: EpisodeWindows,
 }
 
-/// Why metrics cannot be written.
+/// Reason why metrics cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum MetricsError {
-    /// `flights.csv`.
+    /// Error of `episodes.csv`.
     #[error(transparent)]
-    Flights(#[from] FlightsError),
-    /// The event file.
+    Episodes(#[from] EpisodesError),
+    /// Error of the event file.
     #[error(transparent)]
     Events(#[from] EventError),
 }
 
 impl Metrics {
-    /// Continues where the metrics were in `state`. What was written since is dropped, so that nothing is told twice; of a new run that is everything.
+    /// Continues from `state`. Everything written later is dropped, so that nothing is recorded
+    /// twice; for a new run, that is everything.
     ///
     /// # Errors
-    /// [`MetricsError`] names the file; `flights.csv` must be what was written when `state` was taken, or more.
-    pub fn resume(run: &RunDirectory, state: MetricsState, disk: &Disk) -> Result<Self, MetricsError> {
+    /// [`MetricsError`] names the file. `episodes.csv` must begin with the content it had when
+    /// `state` was taken.
+    pub fn resume(
+        run: &RunDirectory,
+        state: MetricsState,
+        disk: &Disk,
+    ) -> Result<Self, MetricsError> {
         state.check(run)?;
         let MetricsState {
-            flights,
-            flights_extent: _,
+            episodes,
+            episodes_extent: _,
             events,
             windows,
         } = state;
         Ok(Self {
             run: run.clone(),
-            rows: flights,
-            flights: FlightsCsv::resume(&run.flights_csv(), flights, disk)?,
-            events: EventWriter::resume(&run.tensorboard(), events, flights, disk)?,
+            rows: episodes,
+            episodes: EpisodesCsv::resume(&run.episodes_csv(), episodes, disk)?,
+            events: EventWriter::resume(&run.tensorboard(), events, episodes, disk)?,
             windows,
         })
     }
 
-    /// How far the metrics are. It holds of the files once they are [flushed](Metrics::flush).
+    /// Returns the present extent. It holds for the files once they are [flushed](Metrics::flush).
     pub fn state(&self) -> MetricsState {
         MetricsState {
-            flights: self.rows,
-            flights_extent: self.flights.extent(),
+            episodes: self.rows,
+            episodes_extent: self.episodes.extent(),
             events: self.events.files().to_vec(),
             windows: self.windows.clone(),
         }
     }
 
-    /// The files whose content a checkpoint of the [state](Metrics::state) counts on.
+    /// Files on whose content a checkpoint of the [state](Metrics::state) relies.
     pub fn files(&self) -> Vec<PathBuf> {
         let folder = self.run.tensorboard();
-        let events = self.events.files().iter().map(|file| folder.join(&file.name));
-        // One that was lost can no longer be counted on.
+        let events = self
+            .events
+            .files()
+            .iter()
+            .map(|file| folder.join(&file.name));
+        // A lost file cannot be relied on.
         let events = events.filter(|path| path.exists());
-        std::iter::once(self.run.flights_csv()).chain(events).collect()
+        std::iter::once(self.run.episodes_csv())
+            .chain(events)
+            .collect()
     }
 
-    /// Takes in a committed training flight; called in flight order.
+    /// Records a committed training episode. Call in episode order.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
-    pub fn flight(&mut self, flight: &CommittedFlight) -> Result<(), MetricsError> {
-        let row = FlightRow::from(flight);
-        self.flights.write(&row)?;
+    pub fn episode(&mut self, episode: &CommittedEpisode) -> Result<(), MetricsError> {
+        let row = EpisodeRow::from(episode);
+        self.episodes.write(&row)?;
         self.rows += 1;
         self.windows.total_reward.push(row.total_reward);
         self.windows.walls_passed.push(f32::from(row.walls_passed));
-        let term = |index: usize| {
-            flight
-                .reward_terms
-                .iter()
-                .map(|terms| f64::from(terms[index]))
-                .sum::<f64>()
-        };
-        self.scalars(
-            row.flight,
-            &[
-                (Scalar::Return, row.total_reward.into()),
-                (Scalar::WallsPassed, row.walls_passed.into()),
-                (Scalar::Steps, row.steps as f64),
-                (Scalar::RewardCollision, term(0)),
-                (Scalar::RewardLevelUp, term(1)),
-                (Scalar::RewardDestination, term(2)),
-                (Scalar::RewardAction, term(3)),
-                (
-                    Scalar::WindowReturn,
-                    self.windows.total_reward.mean().unwrap_or_default(),
-                ),
-                (
-                    Scalar::WindowWallsPassed,
-                    self.windows.walls_passed.mean().unwrap_or_default(),
-                ),
-            ],
-        )
+        let window = |average: &MovingAverage| average.mean().unwrap_or_default();
+        let terms = reward_parts(&episode.reward_terms);
+        let mut points = vec![
+            (Scalar::Return.tag(), row.total_reward.into()),
+            (Scalar::WallsPassed.tag(), row.walls_passed.into()),
+            (Scalar::Steps.tag(), row.steps as f64),
+        ];
+        points.extend(terms.iter().map(|(tag, part)| (tag.as_str(), *part)));
+        points.extend([
+            (
+                Scalar::WindowReturn.tag(),
+                window(&self.windows.total_reward),
+            ),
+            (
+                Scalar::WindowWallsPassed.tag(),
+                window(&self.windows.walls_passed),
+            ),
+        ]);
+        Ok(self.events.scalars(row.episode, &points)?)
     }
 
-    /// Appends a point to each of some curves, at training flight `flight`.
+    /// Appends a point to some curves, at training episode `episode`.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
-    pub fn scalars(&mut self, flight: u64, values: &[(Scalar, f64)]) -> Result<(), MetricsError> {
-        let values: Vec<_> = values.iter().map(|&(scalar, value)| (scalar.tag(), value)).collect();
-        Ok(self.events.scalars(flight, &values)?)
+    pub fn scalars(&mut self, episode: u64, values: &[(Scalar, f64)]) -> Result<(), MetricsError> {
+        let values: Vec<_> = values
+            .iter()
+            .map(|&(scalar, value)| (scalar.tag(), value))
+            .collect();
+        Ok(self.events.scalars(episode, &values)?)
     }
 
-    /// Hands everything written to the operating system; called once an epoch, and before a checkpoint that counts on it.
+    /// Hands everything written to the operating system. Called once per epoch, and before a
+    /// checkpoint that relies on it.
     ///
     /// # Errors
     /// [`MetricsError`] names the file.
     pub fn flush(&mut self) -> Result<(), MetricsError> {
-        self.flights.flush()?;
+        self.episodes.flush()?;
         Ok(self.events.flush()?)
     }
 
-    /// Averages over the latest flights.
-    pub fn windows(&self) -> &Windows {
+    /// Averages over the latest episodes.
+    pub fn windows(&self) -> &EpisodeWindows {
         &self.windows
     }
+}
+
+/// Returns the part of each reward term in the return, with its curve's name.
+fn reward_parts(steps: &[[f32; REWARD_TERMS]]) -> [(String, f64); REWARD_TERMS] {
+    std::array::from_fn(|index| {
+        let part = steps.iter().map(|terms| f64::from(terms[index])).sum();
+        (format!("reward/{}", REWARD_TERM_NAMES[index]), part)
+    })
 }
 
 #[cfg(test)]
@@ -210,7 +234,7 @@ mod tests {
     use skein_protocol::transition::Outcome;
 
     use super::*;
-    use crate::flight::samples;
+    use crate::episode::samples;
 
     fn run() -> (tempfile::TempDir, RunDirectory) {
         let directory = tempfile::tempdir().unwrap();
@@ -218,11 +242,11 @@ mod tests {
         (directory, run)
     }
 
-    fn feed(metrics: &mut Metrics, flights: std::ops::Range<u64>) {
-        for number in flights {
-            let mut flight = samples::flight(number, 4, Outcome::Collided);
-            flight.walls_passed = (number % 4) as u8;
-            metrics.flight(&flight).unwrap();
+    fn feed(metrics: &mut Metrics, episodes: std::ops::Range<u64>) {
+        for number in episodes {
+            let mut episode = samples::episode(number, 4, Outcome::Collided);
+            episode.walls_passed = (number % 4) as u8;
+            metrics.episode(&episode).unwrap();
         }
         metrics.flush().unwrap();
     }
@@ -235,11 +259,13 @@ mod tests {
         MetricsState::new(5)
     }
 
-    /// Every point of every curve, in order of tags and steps.
+    /// Every point of every curve, ordered by tag and step.
     fn points(run: &RunDirectory) -> Vec<(String, i64, u32)> {
         let mut points = Vec::new();
         for entry in std::fs::read_dir(run.tensorboard()).unwrap() {
-            points.extend(events::testing::points(&std::fs::read(entry.unwrap().path()).unwrap()));
+            points.extend(events::testing::points(
+                &std::fs::read(entry.unwrap().path()).unwrap(),
+            ));
         }
         points.sort();
         points
@@ -256,7 +282,7 @@ mod tests {
         let at_checkpoint = first.state();
         feed(&mut first, 12..17);
         drop(first);
-        // A life that leaves no checkpoint leaves no point.
+        // An incarnation that leaves no checkpoint leaves no point.
         let mut lost = metrics(&resumed_run, at_checkpoint.clone());
         feed(&mut lost, 12..19);
         drop(lost);
@@ -265,30 +291,50 @@ mod tests {
 
         assert_eq!(last.windows(), whole.windows());
         assert_eq!(whole.windows().walls_passed.mean(), Some(9.0 / 5.0));
-        let read = |run: &RunDirectory| std::fs::read_to_string(run.flights_csv()).unwrap();
+        let read = |run: &RunDirectory| std::fs::read_to_string(run.episodes_csv()).unwrap();
         assert_eq!(read(&resumed_run), read(&whole_run));
         assert_eq!(read(&whole_run).lines().count(), 21);
         assert_eq!(points(&resumed_run), points(&whole_run));
-        assert_eq!(last.files().len(), 3, "flights.csv, and two event files");
+        assert_eq!(last.files().len(), 3, "episodes.csv, and two event files");
     }
 
     #[test]
-    fn a_life_that_died_before_its_first_checkpoint_leaves_nothing() {
+    fn every_reward_term_has_a_curve_of_its_part_in_the_return() {
+        let (_directory, run) = run();
+        let mut metrics = metrics(&run, new());
+        let mut episode = samples::episode(0, 2, Outcome::Collided);
+        let of_step = |step: f32| std::array::from_fn(|index| step * (index as f32 + 1.0));
+        episode.reward_terms = vec![of_step(1.0), of_step(-4.0)];
+        metrics.episode(&episode).unwrap();
+        metrics.flush().unwrap();
+        let parts = points(&run)
+            .into_iter()
+            .filter(|(tag, ..)| tag.starts_with("reward/"))
+            .map(|(tag, _, bits)| (tag, f32::from_bits(bits)));
+        let expected: std::collections::BTreeMap<_, _> = (1u8..)
+            .zip(REWARD_TERM_NAMES)
+            .map(|(number, name)| (format!("reward/{name}"), -3.0 * f32::from(number)))
+            .collect();
+        assert!(parts.eq(expected));
+    }
+
+    #[test]
+    fn an_incarnation_killed_before_its_first_checkpoint_leaves_nothing() {
         let (_directory, run) = run();
         feed(&mut metrics(&run, new()), 0..7);
         std::fs::write(run.tensorboard().join("notes.txt"), "not ours").unwrap();
-        let mut anew = metrics(&run, new());
-        anew.flush().unwrap();
-        assert_eq!(std::fs::read_to_string(run.flights_csv()).unwrap(), "");
+        let mut again = metrics(&run, new());
+        again.flush().unwrap();
+        assert_eq!(std::fs::read_to_string(run.episodes_csv()).unwrap(), "");
         assert_eq!(
             std::fs::read_dir(run.tensorboard()).unwrap().count(),
             2,
-            "the new file, and what is not ours"
+            "the new file, and the foreign one"
         );
     }
 
     #[test]
-    fn a_lost_event_file_is_no_reason_not_to_train() {
+    fn a_lost_event_file_does_not_prevent_training() {
         let (_directory, run) = run();
         let mut first = metrics(&run, new());
         feed(&mut first, 0..3);
@@ -297,6 +343,6 @@ mod tests {
         let mut second = metrics(&run, state);
         feed(&mut second, 3..6);
         assert_eq!(second.files().len(), 2);
-        assert_eq!(points(&run).len(), 3 * 9);
+        assert_eq!(points(&run).len(), 3 * (5 + REWARD_TERMS));
     }
 }

@@ -1,12 +1,14 @@
-//! Averages over the latest flights.
+//! Averages over the latest episodes.
 
 use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
 /// The mean of the latest values.
+/// The mean of the latest values.
 ///
-/// It is summed anew at every call, oldest value first: a running sum would drift, and would depend on where a run was resumed.
+/// The sum is computed again at every call, oldest value first. A running sum would drift, and
+/// would depend on where a run was resumed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MovingAverage {
     window: usize,
@@ -14,7 +16,7 @@ pub struct MovingAverage {
 }
 
 impl MovingAverage {
-    /// An empty one over `window` values, at least 1.
+    /// Creates an empty average over `window` values, at least 1.
     pub fn new(window: usize) -> Self {
         Self {
             window: window.max(1),
@@ -22,12 +24,13 @@ impl MovingAverage {
         }
     }
 
-    /// Whether it is over `window` values and holds no more: one that was read from a file may say anything.
+    /// `true` if it is over `window` values and holds no more than that. An average read from a
+    /// file may be invalid.
     pub fn is_over(&self, window: usize) -> bool {
         self.window == window.max(1) && self.values.len() <= self.window
     }
 
-    /// Takes in the latest value; the oldest leaves when the window is full.
+    /// Adds the latest value; drops the oldest if the window is full.
     pub fn push(&mut self, value: f32) {
         if self.values.len() == self.window {
             self.values.pop_front();
@@ -35,13 +38,13 @@ impl MovingAverage {
         self.values.push_back(value);
     }
 
-    /// The mean of what is in the window; `None` while it is empty.
+    /// Mean of the values in the window; `None` while it is empty.
     pub fn mean(&self) -> Option<f64> {
         let sum: f64 = self.values.iter().map(|&value| f64::from(value)).sum();
         (!self.values.is_empty()).then(|| sum / self.values.len() as f64)
     }
 
-    /// Whether as many values came in as the window holds: before, the mean is over fewer.
+    /// `true` if the window is full; before, the mean is over fewer values.
     pub fn is_full(&self) -> bool {
         self.values.len() == self.window
     }
@@ -52,7 +55,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_average_over_another_window_is_told_from_one_over_this() {
+    fn an_average_over_another_window_is_recognised() {
         let mut average = MovingAverage::new(3);
         (0..5).for_each(|value| average.push(value as f32));
         assert!(average.is_over(3) && !average.is_over(4));

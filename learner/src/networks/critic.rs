@@ -1,12 +1,13 @@
-//! The critic: the value of an action in a state, twice.
+//! The critic: estimates the value of an action in a state, twice.
 
 use skein_protocol::ACTION;
 use tch::Tensor;
 
 use super::{Layout, Linear, Parameters};
 
-/// Three fully connected layers with ReLU between. One network whose last layer gives two estimates of Q, of which the smaller one is used (paper, section 3.4), or two networks with an
-/// estimate each (arXiv:1812.05905), whose errors have less in common.
+/// Three fully connected layers with ReLU between. Either one network whose last layer gives two
+/// estimates of Q (the paper, section 3.4), or two networks with one estimate each
+/// (arXiv:1812.05905), whose errors are less correlated. The smaller estimate is the one used.
 #[derive(Debug, Clone)]
 pub struct Critic {
     networks: Vec<[Linear; 3]>,
@@ -14,7 +15,12 @@ pub struct Critic {
 
 impl Critic {
     /// Describes the layers of `networks`, one or two.
-    pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64, networks: usize) -> Self {
+    pub fn describe(
+        layout: &mut Layout,
+        observation: i64,
+        hidden_width: i64,
+        networks: usize,
+    ) -> Self {
         let mut network = |name: &str| {
             let mut layer = |number: u8, inputs, outputs| {
                 Linear::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
@@ -32,20 +38,34 @@ impl Critic {
         Self { networks }
     }
 
-    /// Both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`: `[n, 2]`.
-    pub fn forward(&self, parameters: &Parameters, observations: &Tensor, actions: &Tensor) -> Tensor {
+    /// Returns both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`:
+    /// `[n, 2]`.
+    pub fn forward(
+        &self,
+        parameters: &Parameters,
+        observations: &Tensor,
+        actions: &Tensor,
+    ) -> Tensor {
         let joined = Tensor::cat(&[observations, actions], 1);
         let estimates = self.networks.iter().map(|[hidden @ .., last]| {
-            let features = hidden.iter().fold(joined.shallow_clone(), |features, layer| {
-                layer.forward(parameters, &features).relu()
-            });
+            let features = hidden
+                .iter()
+                .fold(joined.shallow_clone(), |features, layer| {
+                    layer.forward(parameters, &features).relu()
+                });
             last.forward(parameters, &features)
         });
         Tensor::cat(&estimates.collect::<Vec<_>>(), 1)
     }
 
-    /// The smaller estimate, `[n]`.
-    pub fn smaller(&self, parameters: &Parameters, observations: &Tensor, actions: &Tensor) -> Tensor {
-        self.forward(parameters, observations, actions).amin(1, false)
+    /// Returns the smaller estimate, `[n]`.
+    pub fn smaller(
+        &self,
+        parameters: &Parameters,
+        observations: &Tensor,
+        actions: &Tensor,
+    ) -> Tensor {
+        self.forward(parameters, observations, actions)
+            .amin(1, false)
     }
 }

@@ -1,4 +1,5 @@
-//! The VAE's decoder: latent code to depth image, with or without a look at what the encoder saw on its way.
+//! The VAE's decoder: latent code to depth image, optionally with skip connections from the
+//! encoder.
 
 use skein_protocol::config::DecoderName;
 
@@ -6,13 +7,16 @@ use tch::Tensor;
 
 use super::{Layout, Linear, Parameters, TransposedConvolution};
 
-/// A linear layer to 1024 × 1 × 3, then four transposed convolutions with stride 2, whose kernels give 72 × 128 exactly (paper, section 3.3; channels
-/// as in arXiv:1803.10122). ReLU between, a sigmoid at the end.
+/// A linear layer to 1024 × 1 × 3, then four transposed convolutions with stride 2, whose kernels
+/// give 72 × 128 exactly (the paper, section 3.3; channels as in arXiv:1803.10122). ReLU between, a
+/// sigmoid at the end.
 ///
-/// As a U-Net (arXiv:1505.04597), its last three convolutions also see the encoder's feature maps, the middle of each, cut to the size of what they are laid beside. What
-/// is to be expected: through those maps nearly the whole image comes by without the code, so the reconstruction is far better than a plain decoder's and the code has
-/// little to tell. Only the divergence presses on it, at its usual weight, and presses it towards the prior: in the end it may hold nothing. The policy sees
-/// the code alone. Its convolutions are trained either way, but for a picture, not for a summary of one; what that costs is what the comparison is for.
+/// As a U-Net (arXiv:1505.04597), its last three convolutions also see the encoder's feature maps,
+/// cropped at the centre to the size of the features they are concatenated with. Expected effect:
+/// nearly the whole image passes through those maps, so the reconstruction is far better than a
+/// plain decoder's, and the latent code is hardly needed for it. The divergence still pulls the
+/// code towards the prior, at its usual weight, so the code may end up empty. The policy sees only
+/// the code. The comparison of both decoders measures what that costs.
 #[derive(Debug, Clone, Copy)]
 pub struct Decoder {
     unfold: Linear,
@@ -21,13 +25,19 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Describes the layers, for codes of `latent` numbers.
+    /// Describes the layers, for latent codes of `latent` numbers.
     pub fn describe(layout: &mut Layout, latent: usize, name: DecoderName) -> Self {
         let unfold = Linear::describe(layout, "decoder.linear", latent as i64, 1024 * 3);
         let mut convolution = |number: usize, inputs: i64, outputs: i64, kernel: [i64; 2]| {
-            TransposedConvolution::describe(layout, &format!("decoder.conv{number}"), inputs, outputs, kernel)
+            TransposedConvolution::describe(
+                layout,
+                &format!("decoder.conv{number}"),
+                inputs,
+                outputs,
+                kernel,
+            )
         };
-        // A map of the encoder's has as many channels as what it is laid beside.
+        // An encoder map has as many channels as the features it is concatenated with.
         let sources = match name {
             DecoderName::Plain => 1,
             DecoderName::UNet => 2,
@@ -44,9 +54,14 @@ impl Decoder {
         }
     }
 
-    /// `[n, latent]` to `[n, 1, 72, 128]`, depth in [0, 1]. `maps`: what the encoder's first three convolutions gave, [`Encoded::maps`](super::Encoded::maps).
+    /// Maps `[n, latent]` to `[n, 1, 72, 128]`, depth in [0, 1]. `maps`: outputs of the encoder's
+    /// first three convolutions, [`Encoded::maps`](super::Encoded::maps).
     pub fn forward(&self, parameters: &Parameters, latents: &Tensor, maps: &[Tensor; 3]) -> Tensor {
-        let mut image = self.unfold.forward(parameters, latents).relu_().view([-1, 1024, 1, 3]);
+        let mut image = self
+            .unfold
+            .forward(parameters, latents)
+            .relu_()
+            .view([-1, 1024, 1, 3]);
         let [hidden @ .., last] = &self.convolutions;
         for (convolution, map) in hidden.iter().zip(maps.iter().rev()) {
             image = convolution.forward(parameters, &image).relu_();
@@ -58,11 +73,13 @@ impl Decoder {
     }
 }
 
-/// The middle of `map`, as high and wide as `beside`; both `[n, channels, h, w]`.
+/// Centre crop of `map` to the height and width of `beside`; both `[n, channels, h, w]`.
 fn middle(map: &Tensor, beside: &Tensor) -> Tensor {
-    [2, 3].into_iter().fold(map.shallow_clone(), |map, dimension| {
-        let wanted = beside.size()[dimension as usize];
-        let spare = map.size()[dimension as usize] - wanted;
-        map.narrow(dimension, spare / 2, wanted)
-    })
+    [2, 3]
+        .into_iter()
+        .fold(map.shallow_clone(), |map, dimension| {
+            let wanted = beside.size()[dimension as usize];
+            let spare = map.size()[dimension as usize] - wanted;
+            map.narrow(dimension, spare / 2, wanted)
+        })
 }

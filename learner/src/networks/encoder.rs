@@ -6,11 +6,13 @@ use tch::{Kind, Tensor};
 
 use super::{Convolution, Layout, Linear, Parameters};
 
-/// Bound of the log-variance's magnitude: standard deviations from 0.0067 to 148. Far outside anything a trained encoder gives (the prior's is 1), near enough
-/// that its exponential can never overflow.
+/// Bound on the magnitude of the log-variance: standard deviations from 0.0067 to 148. Trained
+/// encoders stay far inside it (the prior's standard deviation is 1), and the exponential cannot
+/// overflow.
 pub const LOG_VARIANCE_BOUND: f64 = 10.0;
 
-/// Four 4 × 4 convolutions with stride 2 and ReLU, 32 to 256 channels, and a linear head (paper, section 3.3; channels as in arXiv:1803.10122): what actors fly with,
+/// Four 4 × 4 convolutions with stride 2 and ReLU, 32 to 256 channels, and a linear head (the
+/// paper, section 3.3; channels as in arXiv:1803.10122). This is the part that actors fly with,
 /// whatever trains it.
 #[derive(Debug, Clone, Copy)]
 pub struct ImageEncoder {
@@ -19,24 +21,39 @@ pub struct ImageEncoder {
 }
 
 impl ImageEncoder {
-    /// Describes the layers, in the snapshot layout's order; the head gives `latent` numbers.
+    /// Describes the layers, in the snapshot layout's order; the head outputs `latent` numbers.
     pub fn describe(layout: &mut Layout, latent: usize) -> Self {
         let convolutions = std::array::from_fn(|index| {
-            let [inputs, outputs] = [ENCODER_CHANNELS[index] as i64, ENCODER_CHANNELS[index + 1] as i64];
+            let [inputs, outputs] = [
+                ENCODER_CHANNELS[index] as i64,
+                ENCODER_CHANNELS[index + 1] as i64,
+            ];
             let kernel = [ENCODER_KERNEL as i64; 2];
-            Convolution::describe(layout, &format!("encoder.conv{}", index + 1), inputs, outputs, kernel)
+            Convolution::describe(
+                layout,
+                &format!("encoder.conv{}", index + 1),
+                inputs,
+                outputs,
+                kernel,
+            )
         });
-        let mean = Linear::describe(layout, "encoder.mean", ENCODER_FEATURES as i64, latent as i64);
+        let mean = Linear::describe(
+            layout,
+            "encoder.mean",
+            ENCODER_FEATURES as i64,
+            latent as i64,
+        );
         Self { convolutions, mean }
     }
 
-    /// What the head gives, `[n, latent]`: what the policy sees. `pixels`: `[n, 1, 72, 128]` in [0, 1].
+    /// Returns the head's output, `[n, latent]`, which the policy sees. `pixels`: `[n, 1, 72, 128]`
+    /// in [0, 1].
     pub fn forward(&self, parameters: &Parameters, pixels: &Tensor) -> Tensor {
         let [.., last] = self.maps(parameters, pixels);
         self.mean.forward(parameters, &last.flatten(1, -1))
     }
 
-    /// What each convolution makes of the one before it, `[n, channels, h, w]`.
+    /// Returns the output of each convolution, `[n, channels, h, w]`.
     fn maps(&self, parameters: &Parameters, pixels: &Tensor) -> [Tensor; 4] {
         let mut image = pixels.shallow_clone();
         self.convolutions.map(|convolution| {
@@ -46,9 +63,10 @@ impl ImageEncoder {
     }
 }
 
-/// The VAE's encoder: an [`ImageEncoder`], whose head gives the mean of the code's distribution, and a second head.
+/// The VAE's encoder: an [`ImageEncoder`], whose head gives the mean of the latent code, and a
+/// second head for its log-variance.
 ///
-/// Mean head before log-variance head: what actors need is a prefix of the vector.
+/// The mean head comes first, so that the part actors need is a prefix of the parameter vector.
 #[derive(Debug, Clone, Copy)]
 pub struct Encoder {
     published: ImageEncoder,
@@ -56,35 +74,43 @@ pub struct Encoder {
     published_len: usize,
 }
 
-/// What the VAE's encoder makes of images.
+/// Output of the VAE's encoder.
 #[derive(Debug)]
 pub struct Encoded {
     /// Mean of the latent code, `[n, latent]`.
     pub mean: Tensor,
     /// Logarithm of its variance, `[n, latent]`, bounded.
     pub log_variance: Tensor,
-    /// What the first three convolutions gave, `[n, channels, h, w]`: 32 × 35 × 63, 64 × 16 × 30, 128 × 7 × 14.
+    /// Outputs of the first three convolutions, `[n, channels, h, w]`: 32 × 35 × 63, 64 × 16 × 30,
+    /// 128 × 7 × 14.
     pub maps: [Tensor; 3],
 }
 
 impl Encoder {
-    /// Describes the part that actors need, convolutions and mean head, and then the log-variance head; each head gives `latent` numbers.
+    /// Describes the part that actors need, convolutions and mean head, then the log-variance head.
+    /// Each head outputs `latent` numbers.
     pub fn describe(layout: &mut Layout, latent: usize) -> Self {
         let published = ImageEncoder::describe(layout, latent);
         let published_len = layout.len();
         Self {
             published,
-            log_variance: Linear::describe(layout, "encoder.log_variance", ENCODER_FEATURES as i64, latent as i64),
+            log_variance: Linear::describe(
+                layout,
+                "encoder.log_variance",
+                ENCODER_FEATURES as i64,
+                latent as i64,
+            ),
             published_len,
         }
     }
 
-    /// Length of the part that actors need, from the beginning of the vector.
+    /// Length of the part that actors need, a prefix of the parameter vector.
     pub fn published_len(&self) -> usize {
         self.published_len
     }
 
-    /// The distribution of the latent code, and the maps that it was made from. `pixels`: `[n, 1, 72, 128]` in [0, 1].
+    /// Returns the distribution of the latent code and the feature maps on the way. `pixels`:
+    /// `[n, 1, 72, 128]` in [0, 1].
     pub fn encode(&self, parameters: &Parameters, pixels: &Tensor) -> Encoded {
         let [first, second, third, last] = self.published.maps(parameters, pixels);
         let features = last.flatten(1, -1);
@@ -96,13 +122,13 @@ impl Encoder {
         }
     }
 
-    /// Mean of the latent code, `[n, latent]`: what the policy sees.
+    /// Returns the mean of the latent code, `[n, latent]`, which the policy sees.
     pub fn mean(&self, parameters: &Parameters, pixels: &Tensor) -> Tensor {
         self.published.forward(parameters, pixels)
     }
 }
 
-/// Depth images as the encoder takes them: `[n, 72, 128]` u8 to `[n, 1, 72, 128]` f32 in [0, 1].
+/// Converts depth images to encoder input: `[n, 72, 128]` u8 to `[n, 1, 72, 128]` f32 in [0, 1].
 pub fn pixels(images: &Tensor) -> Tensor {
     let shape = [-1, 1, IMAGE_HEIGHT as i64, IMAGE_WIDTH as i64];
     images

@@ -1,7 +1,8 @@
-//! All parameters of a network in one flat tensor, of which the layers' tensors are views.
+//! All parameters of a network in one flat tensor; the layers' tensors are views of it.
 //!
-//! One vector makes everything around a network simple: the optimizer's state is two more vectors, a target network follows by one operation, a
-//! snapshot is a copy of bytes, and nothing can be forgotten in a checkpoint.
+//! One vector simplifies everything around a network. The optimizer's state is two more vectors, a
+//! target network follows by one operation, a snapshot is one copy, and a checkpoint cannot miss a
+//! tensor.
 
 use std::ops::Range;
 
@@ -9,37 +10,37 @@ use tch::{Device, Tensor, no_grad_guard};
 
 use crate::noise::Noise;
 
-/// One tensor of a network.
+/// Name, shape and initial range of one tensor of a network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterSpec {
-    /// Its name, such as `encoder.conv1.weight`.
+    /// Name, such as `encoder.conv1.weight`.
     pub name: String,
-    /// Its shape, in PyTorch's conventions.
+    /// Shape, in PyTorch's conventions.
     pub shape: Vec<i64>,
-    /// Its initial elements are drawn evenly from `[-bound, bound)`.
+    /// Initial elements are uniform in `[-bound, bound)`.
     pub initial_bound: f32,
 }
 
 impl ParameterSpec {
-    /// Number of its elements.
+    /// Number of elements.
     pub fn len(&self) -> usize {
         self.shape.iter().product::<i64>() as usize
     }
 
-    /// Whether it has no element.
+    /// `true` if the tensor has no element.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// The tensors of a network in the order they lie in its flat vector; filled as the layers are described.
+/// The tensors of a network in the order of its flat vector, appended as the layers are described.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Layout {
     tensors: Vec<ParameterSpec>,
 }
 
 impl Layout {
-    /// Appends a tensor; returns its place in the order.
+    /// Appends a tensor; returns its index.
     pub(super) fn push(&mut self, name: String, shape: &[i64], initial_bound: f32) -> usize {
         self.tensors.push(ParameterSpec {
             name,
@@ -49,17 +50,17 @@ impl Layout {
         self.tensors.len() - 1
     }
 
-    /// The tensors in order.
+    /// The tensors, in order.
     pub fn tensors(&self) -> &[ParameterSpec] {
         &self.tensors
     }
 
-    /// Number of all elements described so far.
+    /// Number of elements described so far.
     pub fn len(&self) -> usize {
         self.tensors.iter().map(ParameterSpec::len).sum()
     }
 
-    /// Initial values, drawn tensor by tensor in order. They depend on the seed alone.
+    /// Returns initial values, drawn tensor by tensor in order. They depend on the seed alone.
     pub fn initial_values(&self, seed: u64) -> Vec<f32> {
         let mut noise = Noise::new(seed);
         let mut values = Vec::with_capacity(self.len());
@@ -69,36 +70,40 @@ impl Layout {
         values
     }
 
-    /// Draws the weights described so far, biases apart, from a range that is wider by `factor`.
+    /// Widens the initial range of the weights described so far by `factor`; biases keep theirs.
     pub(crate) fn widen_weights(&mut self, factor: f32) {
-        for tensor in self.tensors.iter_mut().filter(|tensor| tensor.shape.len() > 1) {
+        for tensor in self
+            .tensors
+            .iter_mut()
+            .filter(|tensor| tensor.shape.len() > 1)
+        {
             tensor.initial_bound *= factor;
         }
     }
 
-    /// Whether nothing was described yet.
+    /// `true` if no tensor was described yet.
     pub fn is_empty(&self) -> bool {
         self.tensors.is_empty()
     }
 }
 
-/// The numbers of a network: one flat f32 vector, and the layers' tensors as views of it.
+/// The parameters of a network: one flat f32 vector, and the layers' tensors as views of it.
 #[derive(Debug)]
 pub struct Parameters {
     layout: Layout,
     flat: Tensor,
-    /// Leaves of the gradient graph that share `flat`'s storage.
+    /// Leaves of the gradient graph; they share `flat`'s storage.
     views: Vec<Tensor>,
 }
 
 impl Parameters {
-    /// With the layout's initial values, the same on every device.
+    /// Creates the layout's initial values, equal on every device.
     pub fn initialise(layout: Layout, seed: u64, device: Device) -> Self {
         let values = Tensor::from_slice(&layout.initial_values(seed));
         Self::of(layout, values.to_device(device))
     }
 
-    /// The same numbers once more, in storage of their own.
+    /// Copies the parameters into storage of their own.
     pub fn duplicate(&self) -> Self {
         Self::of(self.layout.clone(), self.flat.copy())
     }
@@ -116,54 +121,64 @@ impl Parameters {
                 view.set_requires_grad(true)
             })
             .collect();
-        Self { layout, flat, views }
+        Self {
+            layout,
+            flat,
+            views,
+        }
     }
 
-    /// The same numbers in double precision, for checks against finite differences.
+    /// Copies the parameters in double precision, for checks against finite differences.
     #[cfg(test)]
     pub(crate) fn to_double(&self) -> Self {
         Self::of(self.layout.clone(), self.flat.to_kind(tch::Kind::Double))
     }
 
-    /// The names and shapes of the tensors.
+    /// Names and shapes of the tensors.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
 
-    /// All numbers, `[layout().len()]`.
+    /// All parameters, `[layout().len()]`.
     pub fn flat(&self) -> &Tensor {
         &self.flat
     }
 
-    /// All numbers, to be changed in place; every view changes with them. Only with gradients switched off.
+    /// All parameters, to change in place; every view changes with them. Use only with gradients
+    /// switched off.
     pub fn flat_mut(&mut self) -> &mut Tensor {
         &mut self.flat
     }
 
-    /// The tensor at this place of the layout.
+    /// The tensor at this index of the layout.
     pub(super) fn tensor(&self, place: usize) -> &Tensor {
         &self.views[place]
     }
 
-    /// Gradient of the scalar `loss` with respect to all numbers, flat; the graph behind `loss` is consumed.
+    /// Gradient of the scalar `loss` with respect to all parameters, flat. Consumes the graph
+    /// behind `loss`.
     pub fn gradient(&self, loss: &Tensor) -> Tensor {
         let gradients = Tensor::run_backward(&[loss], &self.views, false, false);
-        let flattened: Vec<Tensor> = gradients.iter().map(|gradient| gradient.reshape([-1])).collect();
+        let flattened: Vec<Tensor> = gradients
+            .iter()
+            .map(|gradient| gradient.reshape([-1]))
+            .collect();
         Tensor::cat(&flattened, 0)
     }
 
-    /// Moves every number by the share `rate` towards the one in `leader`.
+    /// Moves every parameter towards the one in `leader`, by the fraction `rate` of their
+    /// difference.
     pub fn follow(&mut self, leader: &Self, rate: f64) {
         let _guard = no_grad_guard();
         let _ = self.flat.lerp_(&leader.flat, rate);
     }
 
-    /// Copies a range of the numbers.
+    /// Copies a range of the parameters.
     ///
     /// # Panics
-    /// When the range is outside the vector, or `into` is of another length.
+    /// When the range is outside the vector, or `into` has another length.
     pub fn copy_range(&self, range: Range<usize>, into: &mut [f32]) {
-        assert_eq!(into.len(), range.len(), "one place for each number");
+        assert_eq!(into.len(), range.len(), "as many places as parameters");
         let part = self.flat.narrow(0, range.start as i64, range.len() as i64);
         part.to_device(Device::Cpu).copy_data(into, range.len());
     }
@@ -207,8 +222,14 @@ mod tests {
         // d/da of the sum of squares of a is 2a; d/db of three times the sum of b is 3.
         let loss = parameters.tensor(0).square().sum(None) + 3.0 * parameters.tensor(1).sum(None);
         let gradient = parameters.gradient(&loss);
-        assert_eq!(gradient.narrow(0, 0, 6), 2.0 * parameters.flat().narrow(0, 0, 6));
-        assert_eq!(Vec::<f32>::try_from(gradient.narrow(0, 6, 4)).unwrap(), [3.0; 4]);
+        assert_eq!(
+            gradient.narrow(0, 0, 6),
+            2.0 * parameters.flat().narrow(0, 0, 6)
+        );
+        assert_eq!(
+            Vec::<f32>::try_from(gradient.narrow(0, 6, 4)).unwrap(),
+            [3.0; 4]
+        );
     }
 
     #[test]

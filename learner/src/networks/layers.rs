@@ -1,21 +1,23 @@
-//! The three kinds of layer, each a description of its two tensors.
+//! The three kinds of layer, each described by its two tensors.
 //!
-//! Initial values follow PyTorch's defaults: weights and biases even in ±1/√fan_in (Kaiming uniform with a = √5, He et al. 2015).
+//! Initial values follow PyTorch's defaults: weights and biases uniform in ±1/√fan_in (Kaiming
+//! uniform with a = √5, He et al. 2015).
 
 use tch::Tensor;
 
 use super::{Layout, Parameters};
 
-/// Places of a layer's two tensors in its network's [`Parameters`].
+/// Indices of a layer's two tensors in its network's [`Parameters`].
 #[derive(Debug, Clone, Copy)]
-struct Affine {
+struct LayerTensors {
     weight: usize,
     bias: usize,
 }
 
-impl Affine {
+impl LayerTensors {
     fn describe(layout: &mut Layout, name: &str, weight_shape: &[i64], outputs: i64) -> Self {
-        // PyTorch takes the second dimension for the inputs, also where the weight of a transposed convolution has its outputs there.
+        // PyTorch takes dimension 1 for the inputs, even where a transposed convolution's weight
+        // has its outputs there.
         let fan_in: i64 = weight_shape[1..].iter().product();
         let bound = 1.0 / (fan_in as f32).sqrt();
         Self {
@@ -27,28 +29,42 @@ impl Affine {
 
 /// A fully connected layer.
 #[derive(Debug, Clone, Copy)]
-pub struct Linear(Affine);
+pub struct Linear(LayerTensors);
 
 impl Linear {
     /// Describes a layer with weight `[outputs, inputs]`.
     pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64) -> Self {
-        Self(Affine::describe(layout, name, &[outputs, inputs], outputs))
+        Self(LayerTensors::describe(
+            layout,
+            name,
+            &[outputs, inputs],
+            outputs,
+        ))
     }
 
-    /// `[n, inputs]` to `[n, outputs]`.
+    /// Maps `[n, inputs]` to `[n, outputs]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        input.linear(parameters.tensor(self.0.weight), Some(parameters.tensor(self.0.bias)))
+        input.linear(
+            parameters.tensor(self.0.weight),
+            Some(parameters.tensor(self.0.bias)),
+        )
     }
 }
 
 /// A convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct Convolution(Affine);
+pub struct Convolution(LayerTensors);
 
 impl Convolution {
     /// Describes a layer with weight `[outputs, inputs, height, width]`.
-    pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64, [height, width]: [i64; 2]) -> Self {
-        Self(Affine::describe(
+    pub fn describe(
+        layout: &mut Layout,
+        name: &str,
+        inputs: i64,
+        outputs: i64,
+        [height, width]: [i64; 2],
+    ) -> Self {
+        Self(LayerTensors::describe(
             layout,
             name,
             &[outputs, inputs, height, width],
@@ -56,21 +72,30 @@ impl Convolution {
         ))
     }
 
-    /// `[n, inputs, h, w]` to `[n, outputs, (h - height) / 2 + 1, (w - width) / 2 + 1]`.
+    /// Maps `[n, inputs, h, w]` to `[n, outputs, (h - height) / 2 + 1, (w - width) / 2 + 1]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        let (weight, bias) = (parameters.tensor(self.0.weight), parameters.tensor(self.0.bias));
+        let (weight, bias) = (
+            parameters.tensor(self.0.weight),
+            parameters.tensor(self.0.bias),
+        );
         input.conv2d(weight, Some(bias), [2, 2], [0, 0], [1, 1], 1)
     }
 }
 
 /// A transposed convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct TransposedConvolution(Affine);
+pub struct TransposedConvolution(LayerTensors);
 
 impl TransposedConvolution {
     /// Describes a layer with weight `[inputs, outputs, height, width]`.
-    pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64, [height, width]: [i64; 2]) -> Self {
-        Self(Affine::describe(
+    pub fn describe(
+        layout: &mut Layout,
+        name: &str,
+        inputs: i64,
+        outputs: i64,
+        [height, width]: [i64; 2],
+    ) -> Self {
+        Self(LayerTensors::describe(
             layout,
             name,
             &[inputs, outputs, height, width],
@@ -78,9 +103,12 @@ impl TransposedConvolution {
         ))
     }
 
-    /// `[n, inputs, h, w]` to `[n, outputs, 2 (h - 1) + height, 2 (w - 1) + width]`.
+    /// Maps `[n, inputs, h, w]` to `[n, outputs, 2 (h - 1) + height, 2 (w - 1) + width]`.
     pub fn forward(&self, parameters: &Parameters, input: &Tensor) -> Tensor {
-        let (weight, bias) = (parameters.tensor(self.0.weight), parameters.tensor(self.0.bias));
+        let (weight, bias) = (
+            parameters.tensor(self.0.weight),
+            parameters.tensor(self.0.bias),
+        );
         input.conv_transpose2d(weight, Some(bias), [2, 2], [0, 0], [0, 0], 1, [1, 1])
     }
 }

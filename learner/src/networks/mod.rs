@@ -1,8 +1,10 @@
-//! The networks: what they compute, apart from the numbers they compute it with.
+//! The networks: what they compute, separate from the parameters they compute it with.
 //!
-//! A network here is a description only: its layers know their place in a flat vector of parameters, and every forward pass is given the vector
-//! ([`Parameters`]) it shall use. So the critic and its slowly following target are one network with two vectors, the optimizer steps one tensor,
-//! and publishing a network is one copy.
+//! A network here is only a description. Its layers know their ranges in a flat parameter vector,
+//! and every forward pass receives that vector ([`Parameters`]). So the critic and its target are
+//! one network with two vectors, the optimizer steps one tensor, and publishing a network is one
+//! copy.
+//! tensor, and publishing a network is one copy.
 
 mod critic;
 mod decoder;

@@ -1,4 +1,4 @@
-//! What moves the encoder and what does not, and that images are learned from.
+//! Which loss moves the encoder, and that images are learned from.
 
 use skein_kernels::Team;
 use skein_protocol::IMAGE_PIXELS;
@@ -7,17 +7,18 @@ use skein_protocol::snapshot::SnapshotLayout;
 use tch::Device;
 
 use super::*;
-use crate::algorithm::{self, Algorithm};
+use crate::algorithm::{Algorithm, Inputs};
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
 use crate::noise::Noise;
 use crate::sac::samples::{Transitions, shade};
 use crate::state::TensorValues;
+use crate::trainer::new_algorithm;
 
 const ALGORITHMS: [AlgorithmName; 2] = [AlgorithmName::Sac, AlgorithmName::Td3];
-/// Numbers of the code.
+/// Length of the latent code.
 const LATENT: usize = 16;
-/// Numbers in an observation: velocity beside the code.
+/// Width of an observation: velocity beside the code.
 const OBSERVATION: usize = LATENT + 2;
 
 fn config(algorithm: AlgorithmName) -> Config {
@@ -34,17 +35,27 @@ fn config(algorithm: AlgorithmName) -> Config {
 
 fn new(config: &Config) -> Box<dyn Algorithm> {
     crate::device::use_threads(1);
-    algorithm::new(config, Device::Cpu)
+    new_algorithm(config, Device::Cpu)
 }
 
-fn update(algorithm: &mut dyn Algorithm, seen: &Transitions, noise: &mut Noise) -> Result<(), UpdateError> {
-    algorithm.update(&mut Team::new(1), seen.columns(), noise).map(|_| ())
+fn update(
+    algorithm: &mut dyn Algorithm,
+    seen: &Transitions,
+    noise: &mut Noise,
+) -> Result<(), UpdateError> {
+    algorithm
+        .update(&mut Team::new(1), seen.columns(), noise)
+        .map(|_| ())
 }
 
-/// Transitions that go on, so that what comes after counts.
+/// Transitions of which most are not terminal, so that the next state matters.
 fn random(rows: usize, seed: u64) -> Transitions {
     let mut noise = Noise::new(seed);
-    let mut draw = || (0..rows * IMAGE_PIXELS).map(|_| shade(noise.uniform(1.0))).collect();
+    let mut draw = || {
+        (0..rows * IMAGE_PIXELS)
+            .map(|_| shade(noise.uniform(1.0)))
+            .collect()
+    };
     let images = Some([draw(), draw()]);
     Transitions {
         images,
@@ -52,7 +63,7 @@ fn random(rows: usize, seed: u64) -> Transitions {
     }
 }
 
-/// The parameters of this name.
+/// The parameters under this name.
 fn part(algorithm: &mut dyn Algorithm, name: &str) -> Vec<f32> {
     let parts = algorithm.named_tensors();
     let part = parts.into_iter().find(|part| part.name.ends_with(name));
@@ -82,17 +93,29 @@ fn the_critics_loss_moves_every_tensor_of_the_encoder_and_its_target_follows() {
             encoder_of(&*algorithm, &config),
             part(&mut *algorithm, target)[encoder.clone()].to_vec(),
         );
-        assert_eq!(before, target_before, "the target begins where the critic does");
+        assert_eq!(
+            before, target_before,
+            "the target begins where the critic does"
+        );
         update(&mut *algorithm, &random(6, 1), &mut Noise::new(2)).unwrap();
         let after = encoder_of(&*algorithm, &config);
         let target_after = &part(&mut *algorithm, target)[encoder.clone()];
-        for tensor in layout.tensors().iter().filter(|tensor| tensor.range.end <= encoder.end) {
+        for tensor in layout
+            .tensors()
+            .iter()
+            .filter(|tensor| tensor.range.end <= encoder.end)
+        {
             let moved = |before: &[f32], after: &[f32]| {
-                let pairs = before[tensor.range.clone()].iter().zip(&after[tensor.range.clone()]);
-                pairs.map(|(before, after)| (after - before).abs()).fold(0.0, f32::max)
+                let pairs = before[tensor.range.clone()]
+                    .iter()
+                    .zip(&after[tensor.range.clone()]);
+                pairs
+                    .map(|(before, after)| (after - before).abs())
+                    .fold(0.0, f32::max)
             };
             let (learned, followed) = (moved(&before, &after), moved(&target_before, target_after));
-            // Adam's first step is as long as its rate, and the target goes a small share of that.
+            // Adam's first step is as long as its rate; the target moves by a small fraction of
+            // that.
             assert!(learned > 1e-4, "{name}: {} stood still", tensor.name);
             assert!(
                 followed > 0.0 && followed < 0.02 * learned,
@@ -126,46 +149,70 @@ fn the_policys_loss_moves_the_policy_and_leaves_the_encoder_alone() {
             [before.0 != after.0, before.1 != after.1]
         };
         let without_critic = |config: &mut Config, rate| {
-            (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (rate, rate);
+            (
+                config.sac.critic_learning_rate,
+                config.td3.critic_learning_rate,
+            ) = (rate, rate);
         };
         let without_policy = |config: &mut Config, rate| {
-            (config.sac.policy_learning_rate, config.td3.policy_learning_rate) = (rate, rate);
+            (
+                config.sac.policy_learning_rate,
+                config.td3.policy_learning_rate,
+            ) = (rate, rate);
         };
-        assert_eq!(after(without_critic, none), [false, true], "{name}: the policy's loss");
-        assert_eq!(after(without_policy, none), [true, false], "{name}: the critic's loss");
+        assert_eq!(
+            after(without_critic, none),
+            [false, true],
+            "{name}: the policy's loss"
+        );
+        assert_eq!(
+            after(without_policy, none),
+            [true, false],
+            "{name}: the critic's loss"
+        );
     }
 }
 
 #[test]
-fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
+fn policy_inputs_carry_no_gradient_and_critic_inputs_do() {
     crate::device::use_threads(1);
     let mut layout = Layout::default();
     let perception = Perception::describe(&mut layout, LATENT);
     let critic = Parameters::initialise(layout.clone(), 1, Device::Cpu);
     let target = Parameters::initialise(layout, 2, Device::Cpu);
     let seen = random(3, 1);
-    let inputs = algorithm::Inputs {
+    let inputs = Inputs {
         from_image: Some(LATENT),
-        ..algorithm::Inputs::same(OBSERVATION)
+        ..Inputs::same(OBSERVATION)
     };
-    for ahead in [LooksAhead::Learned, LooksAhead::Target] {
-        let mut batch = Batch::new(seen.columns(), inputs, Device::Cpu);
+    for ahead in [NextStateEncoder::Learned, NextStateEncoder::Target] {
+        let mut batch = TensorBatch::new(seen.columns(), inputs, Device::Cpu);
         let (now, next) = (batch.observations.copy(), batch.next_observations.copy());
-        perception.look(&mut batch, &critic, &target, ahead);
+        perception.encode(&mut batch, &critic, &target, ahead);
         let carry = [
             &batch.states,
             &batch.observations,
             &batch.next_states,
             &batch.next_observations,
         ];
-        assert_eq!(carry.map(Tensor::requires_grad), [true, false, false, false]);
-        assert_eq!(batch.observations, batch.states.detach(), "both see the same");
+        assert_eq!(
+            carry.map(Tensor::requires_grad),
+            [true, false, false, false]
+        );
+        assert_eq!(
+            batch.observations,
+            batch.states.detach(),
+            "both see the same"
+        );
         assert_eq!(
             batch.next_observations == batch.next_states,
-            ahead == LooksAhead::Target,
+            ahead == NextStateEncoder::Target,
             "two encoders see two things"
         );
-        for (seen, flown) in [(&batch.observations, &now), (&batch.next_observations, &next)] {
+        for (seen, flown) in [
+            (&batch.observations, &now),
+            (&batch.next_observations, &next),
+        ] {
             let beside = |all: &Tensor| all.narrow(1, LATENT as i64, 2);
             assert_eq!(beside(seen), beside(flown), "the velocity is as it was");
             assert_ne!(
@@ -178,7 +225,7 @@ fn what_the_policy_sees_carries_no_gradient_and_what_the_critic_judges_does() {
 }
 
 #[test]
-fn what_actors_saw_when_they_flew_changes_nothing() {
+fn latent_codes_from_the_flight_change_nothing() {
     for name in ALGORITHMS {
         let learned = |code: f32| {
             let mut seen = random(4, 1);
@@ -196,7 +243,7 @@ fn what_actors_saw_when_they_flew_changes_nothing() {
 }
 
 #[test]
-fn a_restored_algorithm_goes_on_bit_for_bit() {
+fn a_restored_algorithm_continues_bit_for_bit() {
     for name in ALGORITHMS {
         let config = config(name);
         let mut algorithm = new(&config);
@@ -208,8 +255,14 @@ fn a_restored_algorithm_goes_on_bit_for_bit() {
         for algorithm in [&mut algorithm, &mut resumed] {
             update(&mut **algorithm, &random(4, 2), &mut Noise::new(2)).unwrap();
         }
-        assert!(algorithm.named_tensors() == resumed.named_tensors(), "{name}");
-        assert_eq!(encoder_of(&*algorithm, &config), encoder_of(&*resumed, &config));
+        assert!(
+            algorithm.named_tensors() == resumed.named_tensors(),
+            "{name}"
+        );
+        assert_eq!(
+            encoder_of(&*algorithm, &config),
+            encoder_of(&*resumed, &config)
+        );
         let mut fresh = new(&other);
         update(&mut *fresh, &random(4, 2), &mut Noise::new(2)).unwrap();
         assert!(
@@ -226,7 +279,8 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut seen = random(4, 1);
         seen.rewards[2] = f32::NAN;
         let before = algorithm.named_tensors();
-        let UpdateError::NonFinite { tensor, update } = update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
+        let UpdateError::NonFinite { tensor, update } =
+            update(&mut *algorithm, &seen, &mut Noise::new(1)).unwrap_err();
         assert_eq!((tensor, update), ("critic loss", 1), "{name}");
         assert!(algorithm.named_tensors() == before, "{name}");
     }
@@ -236,21 +290,32 @@ fn an_update_that_is_not_finite_changes_nothing() {
 #[should_panic(expected = "two images for each transition")]
 fn a_minibatch_without_images_is_a_mistake() {
     let seen = Transitions::random(OBSERVATION, 3, &mut Noise::new(1));
-    let _ = update(&mut *new(&config(AlgorithmName::Sac)), &seen, &mut Noise::new(1));
+    let _ = update(
+        &mut *new(&config(AlgorithmName::Sac)),
+        &seen,
+        &mut Noise::new(1),
+    );
 }
 
 #[test]
-fn what_can_only_be_seen_in_the_image_is_learned() {
+fn a_reward_that_only_the_image_shows_is_learned() {
     for name in ALGORITHMS {
         let mut config = config(name);
-        (config.sac.critic_learning_rate, config.td3.critic_learning_rate) = (1e-3, 1e-3);
+        (
+            config.sac.critic_learning_rate,
+            config.td3.critic_learning_rate,
+        ) = (1e-3, 1e-3);
         let mut algorithm = new(&config);
         let (mut data, mut noise) = (Noise::new(1), Noise::new(2));
         let losses: Vec<f32> = (0..120)
             .map(|_| {
-                let seen = Transitions::looking(OBSERVATION, 8, &mut data);
-                let metrics = algorithm.update(&mut Team::new(1), seen.columns(), &mut noise).unwrap();
-                let loss = metrics.iter().find(|(scalar, _)| *scalar == Scalar::CriticLoss);
+                let seen = Transitions::one_step_task_in_images(OBSERVATION, 8, &mut data);
+                let metrics = algorithm
+                    .update(&mut Team::new(1), seen.columns(), &mut noise)
+                    .unwrap();
+                let loss = metrics
+                    .iter()
+                    .find(|(scalar, _)| *scalar == Scalar::CriticLoss);
                 loss.unwrap().1
             })
             .collect();
@@ -263,7 +328,8 @@ fn what_can_only_be_seen_in_the_image_is_learned() {
     }
 }
 
-/// Prints what an update takes of a processor: `cargo test --release -p skein-learner -- --ignored --nocapture update_from_64_images`.
+/// Prints the processor time of an update: `cargo test --release -p skein-learner -- --ignored
+/// --nocapture update_from_64_images`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_an_update_from_64_images() {
@@ -281,6 +347,9 @@ fn time_of_an_update_from_64_images() {
         for _ in 0..UPDATES {
             update(&mut *algorithm, &seen, &mut noise).unwrap();
         }
-        println!("{name}: {:.0} ms", (spent() - before) / UPDATES as f64 * 1e3);
+        println!(
+            "{name}: {:.0} ms",
+            (spent() - before) / UPDATES as f64 * 1e3
+        );
     }
 }

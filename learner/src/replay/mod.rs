@@ -1,12 +1,18 @@
-//! The split replay buffer (paper, section 3.5).
+//! The split replay buffer (the paper, section 3.5).
 //!
-//! Successful avoidance is rare in the beginning and would drown among everything else, so it has a part of its own with a fixed share of every
-//! minibatch. (With a share of nought there is one part for all, the ordinary buffer.) Each part is a [`ring`] of self-contained rows. Whole flights go in, in flight order, or their legs, and nothing here is random but what the
-//! caller's seeded generator draws: the content is a function of the flights, and a minibatch one of content and seed.
+//! Successful avoidance is rare at the beginning and would be lost among everything else. So it has
+//! a part of its own, with a fixed share of every minibatch. (With a share of zero there is only
+//! one part, the ordinary buffer.) Each part is a [`ring`] of self-contained rows.
 //!
-//! While the VAE is trained, the depth [`images`] of stored transitions are kept: the VAE learns from them, and when it is frozen the latent codes of all
-//! rows, each made by the encoder of its day, are made anew with the final one. Then the images go. Where the encoder is trained end to end they stay: a minibatch
-//! then holds the images of its transitions, as long as the transitions are stored.
+//! Whole episodes or their segments are inserted, in episode order. The only randomness is the
+//! caller's seeded generator. So the content is a function of the episodes, and a minibatch is a
+//! function of content and seed.
+//!
+//! While the VAE is trained, the depth [`images`] of stored transitions are kept, because the VAE
+//! learns from them. Each row's latent code comes from the encoder of its time; when the VAE is
+//! frozen, all codes are computed again with the final encoder, and the images are dropped. Where
+//! the encoder is trained end to end, images stay as long as their transitions, and a minibatch
+//! contains them.
 
 mod images;
 mod ring;
@@ -18,98 +24,110 @@ mod tests;
 use std::sync::Arc;
 
 use rand::{Rng, RngExt};
-use skein_protocol::config::{Config, EncoderTraining, ReplaySection, View};
-use skein_protocol::ids::FlightId;
+use skein_protocol::config::{Config, EncoderTraining, ObservationLayout, ReplaySection};
+use skein_protocol::ids::EpisodeId;
 use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
 
-use crate::flight::{CommittedFlight, FlightFault};
+use crate::episode::{CommittedEpisode, MalformedEpisode};
 use images::ImageStore;
 use ring::{Ring, RowLayout};
 
 pub use ring::RingState;
-pub use state::{ReplayState, RestoreError};
+pub use state::{ReplayRestoreError, ReplayState};
 use success::success_steps;
 
 /// The split replay buffer.
 #[derive(Debug)]
 pub struct Replay {
     section: ReplaySection,
-    view: View,
+    view: ObservationLayout,
     success: Ring,
     regular: Ring,
-    /// Until the VAE is frozen; for ever where the policy learns from them.
+    /// Depth images: kept until the VAE is frozen, or for the whole run where the policy learns
+    /// from them.
     images: Option<ImageStore>,
-    /// What learns from the images.
+    /// Training of the encoder, hence the use of the images.
     encoder: EncoderTraining,
-    /// Images from which on those that no transition needs are looked for, where a policy learns from them.
+    /// Number of images above which unneeded ones are searched for, where a policy learns from
+    /// images.
     sweep_above: usize,
-    /// The flight that was stored last, and how many steps of it: what a later leg must follow. In no checkpoint, as those lie between flights.
-    last: Option<(FlightId, usize)>,
+    /// Episode stored last and its number of steps so far, which a later segment must follow.
+    /// Checkpoints do not contain it: they lie between episodes.
+    last: Option<(EpisodeId, usize)>,
 }
 
 /// A minibatch of transitions in flat buffers that are reused from draw to draw.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Minibatch {
-    /// `[batch, observation]`.
+    /// Observations before the action, `[batch, observation]`.
     pub observations: Vec<f32>,
-    /// `[batch, 2]`.
+    /// Actions, `[batch, 2]`.
     pub actions: Vec<f32>,
-    /// `[batch]`.
+    /// Rewards, `[batch]`.
     pub rewards: Vec<f32>,
-    /// `[batch, observation]`.
+    /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// What the critic alone sees, `[batch, TRUE_STATE]`; empty if that is the observation.
+    /// Critic inputs before the action, `[batch, PRIVILEGED_STATE]`; empty if the critic sees the
+    /// observation.
     pub true_states: Vec<f32>,
-    /// The same after the action.
+    /// Critic inputs after the action, likewise.
     pub next_true_states: Vec<f32>,
-    /// `[batch]`: 1 where the flight ended in a state without a future, else 0. A flight's last step before the time limit is 0: it bootstraps.
+    /// 1 where the episode ended in a state without a future, else 0; `[batch]`. The last step of a
+    /// truncated episode has 0: it bootstraps.
     pub terminated: Vec<f32>,
-    /// Depth images of the observations, `[batch, 72, 128]`, where the encoder is trained end to end; else empty.
+    /// Depth images before the action, `[batch, 72, 128]`, where the encoder is trained end to end;
+    /// else empty.
     pub images: Vec<u8>,
-    /// Those of the next observations.
+    /// Depth images after the action, likewise.
     pub next_images: Vec<u8>,
-    /// Slots drawn, before any row is touched: the loads of many rows are then under way at one time.
+    /// Slots drawn before any row is read, so that the loads of many rows overlap.
     slots: Vec<usize>,
 }
 
-/// Why a flight cannot be stored. Nothing of it is.
+/// Reason why an episode cannot be stored. Nothing of it is stored then.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InsertError {
-    /// Its parts do not belong together.
+    /// The episode's parts do not fit together.
     #[error(transparent)]
-    Fault(#[from] FlightFault),
-    /// It is a leg, and what was stored last is not what was flown before it.
-    #[error("a leg of flight {flight} from its step {first_step} on cannot follow what was stored before it")]
+    Fault(#[from] MalformedEpisode),
+    /// A segment does not follow what was stored last.
+    #[error(
+        "a segment of episode {episode} from its step {first_step} on \
+         does not follow what was stored before it"
+    )]
     OutOfPlace {
-        /// The flight.
-        flight: FlightId,
-        /// Steps flown before.
+        /// Number of the episode.
+        episode: EpisodeId,
+        /// Steps of the episode before the segment.
         first_step: usize,
     },
-    /// It came without depth images while they are learned from.
-    #[error("flight {flight} has no depth images, but images are still learned from")]
+    /// The episode has no depth images, but they are needed.
+    #[error("episode {episode} has no depth images, but images are still learned from")]
     NoImages {
-        /// The flight.
-        flight: FlightId,
+        /// Number of the episode.
+        episode: EpisodeId,
     },
-    /// The images have no room.
-    #[error("{found} depth images of flight {flight} exceed the {limit} that can be needed, {held} of them held")]
+    /// The images exceed the store's limit.
+    #[error(
+        "episode {episode} brings {found} depth images to the {held} stored, \
+         more than the {limit} that can ever be needed"
+    )]
     TooManyImages {
-        /// The flight.
-        flight: FlightId,
-        /// Its images.
+        /// Number of the episode.
+        episode: EpisodeId,
+        /// Number of its images.
         found: usize,
-        /// Images held.
+        /// Number of images stored.
         held: usize,
-        /// Images that may be held.
+        /// Number of images that may be stored.
         limit: usize,
     },
 }
 
 impl Replay {
-    /// An empty buffer for the run configured by `config`.
+    /// Creates an empty buffer for the run that `config` describes.
     pub fn new(config: &Config) -> Self {
-        let view = config.view();
+        let view = config.observation_layout();
         let layout = RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
         Self {
@@ -124,67 +142,83 @@ impl Replay {
         }
     }
 
-    /// Transitions held in both parts.
+    /// Number of transitions in both parts.
     pub fn len(&self) -> usize {
         self.success.len() + self.regular.len()
     }
 
-    /// Whether there is nothing to draw from.
+    /// `true` if there is nothing to sample from.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Transitions held in the success part.
+    /// Number of transitions in the success part.
     pub fn success_len(&self) -> usize {
         self.success.len()
     }
 
-    /// Depth images held; `None` once the VAE is frozen.
+    /// Number of depth images stored; `None` once the VAE is frozen.
     pub fn image_count(&self) -> Option<usize> {
         self.images.as_ref().map(ImageStore::len)
     }
 
-    /// Stores all transitions of `flight`, in order, each in the part the success rule says. Its depth images are taken over while they are learned from, and
-    /// dropped after. Of a later leg the first image is the last one of the leg before, and is not stored twice.
+    /// Stores all transitions of `episode`, in order, each in the part that the success rule names.
+    /// Takes over the depth images while they are learned from, and drops them later. A later
+    /// segment's first image equals the last one of the segment before, and is not stored twice.
     ///
     /// # Errors
-    /// [`InsertError`]; the buffer is as before.
-    pub fn insert(&mut self, mut flight: CommittedFlight) -> Result<(), InsertError> {
-        flight.check()?;
-        self.check_place(&flight)?;
-        let first_image = self.take_images(&mut flight)?;
-        let success = success_steps(&flight.level_up, &self.section);
-        let last = flight.steps() - 1;
+    /// [`InsertError`]; the buffer is unchanged then.
+    pub fn insert(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
+        episode.check()?;
+        self.check_place(&episode)?;
+        let first_image = self.take_images(&mut episode)?;
+        let success = success_steps(&episode.level_up, &self.section);
+        let last = episode.steps() - 1;
         for (step, &success) in success.iter().enumerate() {
-            let ring = if success { &mut self.success } else { &mut self.regular };
+            let ring = if success {
+                &mut self.success
+            } else {
+                &mut self.regular
+            };
             let row = ring.claim(first_image.map(|first| first + step as u32));
-            flight.write_observation(step, &self.view, row.observation);
-            flight.write_observation(step + 1, &self.view, row.next_observation);
-            flight.write_true_state(step, row.true_state);
-            flight.write_true_state(step + 1, row.next_true_state);
-            row.action.copy_from_slice(&flight.actions[step]);
-            *row.reward = flight.rewards[step];
-            *row.terminated = f32::from(step == last && flight.terminated());
+            episode.write_observation(step, &self.view, row.observation);
+            episode.write_observation(step + 1, &self.view, row.next_observation);
+            episode.write_true_state(step, row.true_state);
+            episode.write_true_state(step + 1, row.next_true_state);
+            row.action.copy_from_slice(&episode.actions[step]);
+            *row.reward = episode.rewards[step];
+            *row.terminated = f32::from(step == last && episode.terminated());
         }
-        self.last = Some((flight.flight, flight.first_step + flight.steps()));
+        self.last = Some((episode.episode, episode.first_step + episode.steps()));
         Ok(())
     }
 
-    /// Whether a later leg follows the one before it.
-    fn check_place(&self, flight: &CommittedFlight) -> Result<(), InsertError> {
-        let CommittedFlight { flight, first_step, .. } = *flight;
-        match first_step == 0 || self.last == Some((flight, first_step)) {
+    /// Checks that a later segment follows the one before it.
+    fn check_place(&self, episode: &CommittedEpisode) -> Result<(), InsertError> {
+        let CommittedEpisode {
+            episode,
+            first_step,
+            ..
+        } = *episode;
+        match first_step == 0 || self.last == Some((episode, first_step)) {
             true => Ok(()),
-            false => Err(InsertError::OutOfPlace { flight, first_step }),
+            false => Err(InsertError::OutOfPlace {
+                episode,
+                first_step,
+            }),
         }
     }
 
-    /// Draws `count` transitions uniformly with replacement from each part in the configured ratio; all from the other part while one is empty.
+    /// Samples `count` transitions uniformly with replacement, from each part in the configured
+    /// ratio. While one part is empty, all come from the other.
     ///
     /// # Panics
-    /// When the buffer [is empty](Replay::is_empty): the warm-up is over before anything is drawn.
+    /// When the buffer [is empty](Replay::is_empty): the warm-up ends before anything is sampled.
     pub fn sample(&self, rng: &mut impl Rng, count: usize, into: &mut Minibatch) {
-        assert!(!self.is_empty(), "nothing can be drawn from an empty replay buffer");
+        assert!(
+            !self.is_empty(),
+            "cannot sample from an empty replay buffer"
+        );
         let from_success = match (self.success.len(), self.regular.len()) {
             (0, _) => 0,
             (_, 0) => count,
@@ -199,30 +233,30 @@ impl Replay {
         into.gather(&self.regular, images, rng, count - from_success);
     }
 
-    /// Draws `count` depth images uniformly with replacement, `[count, 72, 128]`, for a step of the VAE.
+    /// Samples `count` depth images uniformly with replacement, `[count, 72, 128]`, for a VAE step.
     ///
     /// # Panics
-    /// When there are none: none were inserted yet, or the VAE is frozen.
+    /// When there are no images: none were inserted yet, or the VAE is frozen.
     pub fn sample_images(&self, rng: &mut impl Rng, count: usize, into: &mut Vec<u8>) {
         let images = self.images.as_ref().filter(|images| images.len() > 0);
         images
-            .expect("the VAE is trained only before it is frozen and after flights came in")
+            .expect("the VAE is trained only after episodes arrive and before it is frozen")
             .sample(rng, count, into);
     }
 
-    /// Ends the VAE's training: codes stay what they are, and the images are dropped.
+    /// Ends the VAE's training: codes stay as they are, and the images are dropped.
     pub fn freeze(&mut self) {
         self.images = None;
         self.success.forget_images();
         self.regular.forget_images();
     }
 
-    /// Makes every stored latent code anew by `encode`, which turns up to `chunk` images, `[n, 72, 128]`, into as many codes. Does nothing if the VAE is frozen
-    /// already.
+    /// Recomputes every stored latent code with `encode`, which maps up to `chunk` images,
+    /// `[n, 72, 128]`, to as many codes. Does nothing once the VAE is frozen.
     ///
     /// # Errors
-    /// The first that `encode` returns; the buffer is as before.
-    pub fn renew_latents<E>(
+    /// The first error of `encode`; the buffer is unchanged then.
+    pub fn recode_latents<E>(
         &mut self,
         chunk: usize,
         encode: impl FnMut(&[u8]) -> Result<Vec<LatentCode>, E>,
@@ -230,21 +264,25 @@ impl Replay {
         if let Some(images) = &self.images {
             let latents = images.encode(chunk, encode)?;
             for ring in [&mut self.success, &mut self.regular] {
-                ring.replace_latents(&self.view, &latents, |image| images.first_of_flight(image));
+                ring.replace_latents(&self.view, &latents, |image| images.first_of_episode(image));
             }
         }
         Ok(())
     }
 
-    /// Hands the flight's images to the store; the number of the first, if images are stored.
-    fn take_images(&mut self, flight: &mut CommittedFlight) -> Result<Option<u32>, InsertError> {
+    /// Hands the episode's images to the store; returns the number of the first one, if images are
+    /// stored.
+    fn take_images(&mut self, episode: &mut CommittedEpisode) -> Result<Option<u32>, InsertError> {
         if self.images.is_none() {
             return Ok(None);
         }
-        let id = flight.flight;
-        let images = flight.depth.take().ok_or(InsertError::NoImages { flight: id })?;
-        let is_later_leg = flight.first_step > 0;
-        let found = flight.steps() + usize::from(!is_later_leg);
+        let id = episode.episode;
+        let images = episode
+            .depth
+            .take()
+            .ok_or(InsertError::NoImages { episode: id })?;
+        let is_later_segment = episode.first_step > 0;
+        let found = episode.steps() + usize::from(!is_later_segment);
         self.sweep_images(found);
         let Some(store) = &mut self.images else {
             return Ok(None);
@@ -252,22 +290,26 @@ impl Replay {
         if !store.has_room(found) {
             let (held, limit) = (store.len(), store.limit());
             return Err(InsertError::TooManyImages {
-                flight: id,
+                episode: id,
                 found,
                 held,
                 limit,
             });
         }
-        Ok(Some(match is_later_leg {
+        Ok(Some(match is_later_segment {
             true => store.extend(&images[IMAGE_PIXELS..]),
             false => store.push(Arc::new(images)),
         }))
     }
 
-    /// Gives up the images of transitions that are overwritten, if a policy learns from images and there would be too many with so many more. When that is follows from
-    /// how many are held, so that a buffer restored from a checkpoint does the same. The newest transition's images stay: a leg may follow it.
+    /// Drops the images of overwritten transitions, if a policy learns from images and `more` would
+    /// exceed the threshold. The decision depends only on the number stored, so a buffer restored
+    /// from a checkpoint decides alike. The newest transition's images stay: a segment may follow
+    /// it.
     fn sweep_images(&mut self, more: usize) {
-        let Some(store) = &mut self.images else { return };
+        let Some(store) = &mut self.images else {
+            return;
+        };
         if self.encoder == EncoderTraining::Vae || store.len() + more <= self.sweep_above {
             return;
         }
@@ -294,15 +336,23 @@ impl Minibatch {
         self.next_images.clear();
     }
 
-    /// Appends `count` rows drawn from `ring`, with their `images` if there are any to be learned from.
-    fn gather(&mut self, ring: &Ring, images: Option<&ImageStore>, rng: &mut impl Rng, count: usize) {
+    /// Appends `count` rows drawn from `ring`, with their `images` if the policy learns from them.
+    fn gather(
+        &mut self,
+        ring: &Ring,
+        images: Option<&ImageStore>,
+        rng: &mut impl Rng,
+        count: usize,
+    ) {
         self.slots.clear();
-        self.slots.extend((0..count).map(|_| rng.random_range(0..ring.len())));
+        self.slots
+            .extend((0..count).map(|_| rng.random_range(0..ring.len())));
         self.actions.reserve(count * ACTION);
         for &slot in &self.slots {
             let row = ring.row(slot);
             self.observations.extend_from_slice(row.observation);
-            self.next_observations.extend_from_slice(row.next_observation);
+            self.next_observations
+                .extend_from_slice(row.next_observation);
             self.true_states.extend_from_slice(row.true_state);
             self.next_true_states.extend_from_slice(row.next_true_state);
             self.actions.extend_from_slice(row.action);
@@ -317,7 +367,8 @@ impl Minibatch {
     }
 }
 
-/// Capacities of the success and the regular part; each has room for one transition at least, unless there is to be no success part.
+/// Capacities of the success and the regular part. Each has room for at least one transition,
+/// unless the success share is zero.
 fn capacities(section: &ReplaySection) -> (usize, usize) {
     if section.success_share == 0.0 {
         return (0, section.capacity);
@@ -327,19 +378,23 @@ fn capacities(section: &ReplaySection) -> (usize, usize) {
     (success, section.capacity - success)
 }
 
-/// Images that can be needed. The VAE's training can leave behind: before the epoch in which it is frozen, fewer than `vae.train_steps` steps were flown, with at
-/// most as many closing images; then come the flights of one epoch. Their mirror images come on top. A policy needs those of the transitions held, two each at most, and of the flight that comes in.
+/// Largest number of images that can be needed.
+///
+/// For the VAE: before the epoch that freezes it, fewer than `vae.train_steps` steps were flown,
+/// with at most as many closing images; then the episodes of one epoch are added. For a policy: at
+/// most two images per stored transition, and those of the arriving episodes. Mirror images are
+/// counted too.
 fn image_limit(config: &Config) -> usize {
     let steps = match config.learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps,
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
-    2 * steps * config.learning.times_stored() + epoch_images(config)
+    2 * steps * config.learning.copies_per_transition() + epoch_images(config)
 }
 
-/// Images of an epoch's flights at most.
+/// Largest number of images in an epoch's episodes.
 fn epoch_images(config: &Config) -> usize {
-    config.learning.flights_per_epoch as usize
-        * config.transport.max_records_per_flight
-        * config.learning.times_stored()
+    config.learning.episodes_per_epoch as usize
+        * config.transport.max_records_per_episode
+        * config.learning.copies_per_transition()
 }

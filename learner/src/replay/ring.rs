@@ -1,22 +1,24 @@
 //! One part of the replay: a ring of transition rows.
 //!
-//! A row holds everything an update needs of one transition, observation and next observation both, contiguous in memory: a minibatch of random rows
-//! is bound by cache misses, and a row costs one run of neighbouring cache lines where a table per quantity would cost one miss each.
+//! A row holds everything an update needs of one transition, both observations included, contiguous
+//! in memory. Cache misses limit the reading of random rows: a row costs one run of neighbouring
+//! cache lines, where one table per quantity would cost one miss each.
 
-use skein_protocol::config::{Config, CriticInput, View};
-use skein_protocol::{ACTION, LatentCode, TRUE_STATE};
+use skein_protocol::config::{Config, CriticInput, ObservationLayout};
+use skein_protocol::{ACTION, LatentCode, PRIVILEGED_STATE};
 
-/// Where the parts of a row lie: `[observation | next observation | true state | next true state | action | reward | terminated]`, all `f32`.
+/// Layout of a row: observation, next observation, true state, next true state, action, reward,
+/// terminated, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RowLayout {
     /// Length of an observation vector.
     pub(super) observation: usize,
-    /// Length of what the critic alone sees; 0 if that is the observation.
+    /// Length of the critic's own input; 0 if the critic sees the observation.
     pub(super) true_state: usize,
 }
 
 /// Mutable view of one row.
-pub(super) struct RowMut<'a> {
+pub(super) struct TransitionRowMut<'a> {
     pub(super) observation: &'a mut [f32],
     pub(super) next_observation: &'a mut [f32],
     pub(super) true_state: &'a mut [f32],
@@ -28,7 +30,7 @@ pub(super) struct RowMut<'a> {
 
 /// View of one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Row<'a> {
+pub(super) struct TransitionRow<'a> {
     pub(super) observation: &'a [f32],
     pub(super) next_observation: &'a [f32],
     pub(super) true_state: &'a [f32],
@@ -39,29 +41,29 @@ pub(super) struct Row<'a> {
 }
 
 impl RowLayout {
-    /// That of the run configured by `config`.
+    /// Returns the layout for the run that `config` describes.
     pub(super) fn of(config: &Config) -> Self {
         Self {
-            observation: config.view().len(),
+            observation: config.observation_layout().len(),
             true_state: match config.learning.critic_input {
                 CriticInput::Observation => 0,
-                CriticInput::GroundTruth => TRUE_STATE,
+                CriticInput::GroundTruth => PRIVILEGED_STATE,
             },
         }
     }
 
-    /// Values in a row.
+    /// Number of values in a row.
     pub(super) fn width(self) -> usize {
         2 * (self.observation + self.true_state) + ACTION + 2
     }
 
-    fn row(self, values: &[f32]) -> Row<'_> {
+    fn row(self, values: &[f32]) -> TransitionRow<'_> {
         let (observation, rest) = values.split_at(self.observation);
         let (next_observation, rest) = rest.split_at(self.observation);
         let (true_state, rest) = rest.split_at(self.true_state);
         let (next_true_state, rest) = rest.split_at(self.true_state);
         let (action, rest) = rest.split_at(ACTION);
-        Row {
+        TransitionRow {
             observation,
             next_observation,
             true_state,
@@ -72,14 +74,14 @@ impl RowLayout {
         }
     }
 
-    fn row_mut(self, values: &mut [f32]) -> RowMut<'_> {
+    fn row_mut(self, values: &mut [f32]) -> TransitionRowMut<'_> {
         let (observation, rest) = values.split_at_mut(self.observation);
         let (next_observation, rest) = rest.split_at_mut(self.observation);
         let (true_state, rest) = rest.split_at_mut(self.true_state);
         let (next_true_state, rest) = rest.split_at_mut(self.true_state);
         let (action, rest) = rest.split_at_mut(ACTION);
         let (reward, terminated) = rest.split_at_mut(1);
-        RowMut {
+        TransitionRowMut {
             observation,
             next_observation,
             true_state,
@@ -91,7 +93,7 @@ impl RowLayout {
     }
 }
 
-/// More transitions than a run can commit; they are counted up from here without a look at where numbers end.
+/// More transitions than a run can commit. Below it, counting cannot overflow.
 const MOST_INSERTED: u64 = 1 << 62;
 
 /// A ring of rows; the oldest is overwritten when it is full.
@@ -99,16 +101,18 @@ const MOST_INSERTED: u64 = 1 << 62;
 pub(super) struct Ring {
     layout: RowLayout,
     capacity: usize,
-    /// Rows ever inserted; tells the next slot and how many slots are filled.
+    /// Number of rows ever inserted; determines the next slot and the number of filled slots.
     inserted: u64,
-    /// `[filled, width]`.
+    /// Rows in slot order, `[filled, width]`.
     rows: Vec<f32>,
-    /// The depth image of each row's observation, the next observation's follows it; `[filled]`, or empty once the images are gone.
+    /// Number of the depth image of each row's observation, `[filled]`; the next observation's
+    /// image follows it. Empty once the images are dropped.
     images: Vec<u32>,
 }
 
 impl Ring {
-    /// An empty ring. The memory of all rows is set aside at once, and touched only as they fill: growth never copies them.
+    /// Creates an empty ring. Memory for all rows is reserved at once, so growth never copies them;
+    /// pages are touched only as rows fill.
     pub(super) fn new(capacity: usize, layout: RowLayout) -> Self {
         let rows = Vec::with_capacity(capacity * layout.width());
         Self {
@@ -120,17 +124,28 @@ impl Ring {
         }
     }
 
-    /// A ring as it was, or what is wrong with the parts.
-    pub(super) fn restore(capacity: usize, layout: RowLayout, state: RingState) -> Result<Self, String> {
-        let RingState { inserted, rows, images } = state;
+    /// Restores a ring, or describes what is wrong with the state.
+    pub(super) fn restore(
+        capacity: usize,
+        layout: RowLayout,
+        state: RingState,
+    ) -> Result<Self, String> {
+        let RingState {
+            inserted,
+            rows,
+            images,
+        } = state;
         if inserted > MOST_INSERTED {
-            return Err(format!("{inserted} transitions are more than any run commits"));
+            return Err(format!(
+                "{inserted} transitions are more than any run commits"
+            ));
         }
         let mut ring = Self::new(capacity, layout);
         ring.inserted = inserted;
         if rows.len() != ring.len() * layout.width() {
             return Err(format!(
-                "{inserted} transitions were inserted into a part for {capacity}, so {} values are expected, but {} are stored",
+                "{inserted} transitions were inserted into a part for {capacity}, \
+                 so {} values are expected, but {} are stored",
                 ring.len() * layout.width(),
                 rows.len()
             ));
@@ -140,7 +155,7 @@ impl Ring {
         Ok(ring)
     }
 
-    /// Everything that determines the ring's future.
+    /// Returns everything that determines the ring's future.
     pub(super) fn state(&self) -> RingState {
         RingState {
             inserted: self.inserted,
@@ -149,13 +164,16 @@ impl Ring {
         }
     }
 
-    /// Rows filled.
+    /// Number of filled rows.
     pub(super) fn len(&self) -> usize {
-        usize::try_from(self.inserted).unwrap_or(usize::MAX).min(self.capacity)
+        usize::try_from(self.inserted)
+            .unwrap_or(usize::MAX)
+            .min(self.capacity)
     }
 
-    /// Claims the next slot, the oldest row's if the ring is full. `image` is the number of the observation's depth image while images are stored.
-    pub(super) fn claim(&mut self, image: Option<u32>) -> RowMut<'_> {
+    /// Claims the next slot, the oldest row's if the ring is full. `image`: number of the
+    /// observation's depth image, while images are stored.
+    pub(super) fn claim(&mut self, image: Option<u32>) -> TransitionRowMut<'_> {
         let width = self.layout.width();
         let slot = (self.inserted % self.capacity as u64) as usize;
         if self.len() < self.capacity {
@@ -165,61 +183,69 @@ impl Ring {
             self.images[slot] = image;
         }
         self.inserted += 1;
-        self.layout.row_mut(&mut self.rows[slot * width..(slot + 1) * width])
+        self.layout
+            .row_mut(&mut self.rows[slot * width..(slot + 1) * width])
     }
 
     /// The row in `slot`, below [`Ring::len`].
-    pub(super) fn row(&self, slot: usize) -> Row<'_> {
+    pub(super) fn row(&self, slot: usize) -> TransitionRow<'_> {
         let width = self.layout.width();
-        self.layout.row(&self.rows[slot * width..(slot + 1) * width])
+        self.layout
+            .row(&self.rows[slot * width..(slot + 1) * width])
     }
 
-    /// The image number of every row, `[filled]`; empty once the images are gone.
+    /// Image number of every row, `[filled]`; empty once the images are dropped.
     pub(super) fn images(&self) -> &[u32] {
         &self.images
     }
 
-    /// Gives every image its new number, `[images ever numbered]`.
+    /// Replaces every image number by its new one. `numbers`: by old number.
     pub(super) fn renumber_images(&mut self, numbers: &[u32]) {
         for image in &mut self.images {
             *image = numbers[*image as usize];
         }
     }
 
-    /// Forgets which images the rows are of.
+    /// Drops the image numbers.
     pub(super) fn forget_images(&mut self) {
         self.images = Vec::new();
     }
 
-    /// Rewrites the latent parts of both observations of every row from `latents`, one per image. `first_of_flight` says which image of an image's flight was the
-    /// first.
+    /// Rewrites the latent parts of both observations of every row from `latents`, one per image.
+    /// `first_of_episode` returns the number of the first image of an image's episode.
     pub(super) fn replace_latents(
         &mut self,
-        view: &View,
+        view: &ObservationLayout,
         latents: &[LatentCode],
-        first_of_flight: impl Fn(u32) -> u32,
+        first_of_episode: impl Fn(u32) -> u32,
     ) {
-        for (values, &image) in self.rows.chunks_exact_mut(self.layout.width()).zip(&self.images) {
+        for (values, &image) in self
+            .rows
+            .chunks_exact_mut(self.layout.width())
+            .zip(&self.images)
+        {
             let row = self.layout.row_mut(values);
-            let first = first_of_flight(image);
-            let (flight, step) = (&latents[first as usize..], (image - first) as usize);
+            let first = first_of_episode(image);
+            let (episode, step) = (&latents[first as usize..], (image - first) as usize);
             for (step, observation) in [(step, row.observation), (step + 1, row.next_observation)] {
-                let moments = observation.chunks_exact_mut(view.moment_len());
-                for (moment, seen) in view.moments(step).zip(moments) {
-                    view.write_code(&flight[moment], seen);
+                let moments = observation.chunks_exact_mut(view.step_len());
+                for (moment, seen) in view.seen_steps(step).zip(moments) {
+                    view.write_code(&episode[moment], seen);
                 }
             }
         }
     }
 }
 
-/// A ring's content, for a checkpoint.
+/// Content of a ring, for a checkpoint.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RingState {
-    /// Transitions ever inserted.
+    /// Number of transitions ever inserted.
     pub inserted: u64,
-    /// Rows in slot order, `[filled, width]`: `[observation | next observation | true state | next true state | action | reward | terminated]`.
+    /// Rows in slot order, `[filled, width]`, laid out as observation, next observation, true
+    /// state, next true state, action, reward, terminated.
     pub rows: Vec<f32>,
-    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are kept.
+    /// Number of the depth image of each row's observation, `[filled]`; empty once no images are
+    /// kept.
     pub images: Vec<u32>,
 }

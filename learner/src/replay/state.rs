@@ -1,4 +1,4 @@
-//! The buffer's content for a checkpoint, and back.
+//! Stores the buffer's content for a checkpoint, and restores it.
 
 use std::sync::Arc;
 
@@ -9,51 +9,62 @@ use super::images::ImageStore;
 use super::ring::{Ring, RingState};
 use super::{Replay, capacities};
 
-/// Everything in a [`Replay`] that determines what follows.
+/// Everything in a [`Replay`] that determines its future.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayState {
     /// The success part.
     pub success: RingState,
     /// The regular part.
     pub regular: RingState,
-    /// Depth images, one block a flight, `[images, 72, 128]`; `None` once the VAE is frozen. Shared with the buffer, not copied.
+    /// Depth images, one block per episode, `[images, 72, 128]`; `None` once the VAE is frozen.
+    /// Shared with the buffer, not copied.
     pub images: Option<Vec<Arc<Vec<u8>>>>,
 }
 
-/// Why a stored content does not fit the configured buffer.
+/// Reason why a stored content does not fit the configured buffer.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("the replay buffer's {part} cannot be restored: {problem}")]
-pub struct RestoreError {
-    /// `success part`, `regular part` or `depth images`.
+pub struct ReplayRestoreError {
+    /// Name of the part: `success part`, `regular part` or `depth images`.
     pub part: &'static str,
-    /// What does not fit.
+    /// Description of what does not fit.
     pub problem: String,
 }
 
 impl Replay {
-    /// The content. Rows are copied, which takes some 10 ms for 2^17 of them; images are shared.
+    /// Returns the content. Rows are copied, some 10 ms for 2^17 of them; images are shared.
     pub fn state(&self) -> ReplayState {
         ReplayState {
             success: self.success.state(),
             regular: self.regular.state(),
-            images: self.images.as_ref().map(|images| images.flights().to_vec()),
+            images: self
+                .images
+                .as_ref()
+                .map(|images| images.episodes().to_vec()),
         }
     }
 
-    /// The buffer as it was when [`Replay::state`] was taken.
+    /// Restores the buffer as it was when [`Replay::state`] was called.
     ///
     /// # Errors
-    /// [`RestoreError`] when the content does not fit `config`.
-    pub fn restore(config: &Config, state: ReplayState) -> Result<Self, RestoreError> {
+    /// [`ReplayRestoreError`] when the content does not fit `config`.
+    pub fn restore(config: &Config, state: ReplayState) -> Result<Self, ReplayRestoreError> {
         let mut replay = Self::new(config);
         let layout = super::RowLayout::of(config);
         let (success, regular) = capacities(&config.replay);
-        let fail = |part| move |problem| RestoreError { part, problem };
-        replay.success = Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
-        replay.regular = Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
+        let fail = |part| move |problem| ReplayRestoreError { part, problem };
+        replay.success =
+            Ring::restore(success, layout, state.success).map_err(fail("success part"))?;
+        replay.regular =
+            Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
         match state.images {
-            Some(blocks) => replay.images.iter_mut().try_for_each(|store| fill(store, &blocks)),
-            None if config.learning.end_to_end() => Err("there are none, and the policy learns from them".to_owned()),
+            Some(blocks) => replay
+                .images
+                .iter_mut()
+                .try_for_each(|store| fill(store, &blocks)),
+            None if config.learning.end_to_end() => {
+                Err("there are none, and the policy learns from them".to_owned())
+            }
             None => {
                 replay.images = None;
                 Ok(())
@@ -70,7 +81,8 @@ fn fill(store: &mut ImageStore, blocks: &[Arc<Vec<u8>>]) -> Result<(), String> {
         let images = block.len() / IMAGE_PIXELS;
         if block.len() % IMAGE_PIXELS != 0 || !store.has_room(images) {
             return Err(format!(
-                "a flight's {} bytes are no whole images of {IMAGE_PIXELS}, or more than the {} images that may be held",
+                "an episode's {} bytes are not whole images of {IMAGE_PIXELS} bytes, \
+                 or exceed the {} images that may be stored",
                 block.len(),
                 store.limit()
             ));
@@ -80,7 +92,7 @@ fn fill(store: &mut ImageStore, blocks: &[Arc<Vec<u8>>]) -> Result<(), String> {
     Ok(())
 }
 
-/// Every row has an image that is stored, or, without a store, none has.
+/// Checks that every row has a stored image, or, without a store, that none has.
 fn check_rows(store: Option<&ImageStore>, rings: [&Ring; 2]) -> Result<(), String> {
     let stored = store.map_or(0, ImageStore::len);
     for ring in rings {

@@ -1,13 +1,15 @@
-//! What counts as success experience.
+//! The rule for success experience.
 //!
-//! The paper keeps "experience of avoiding an obstacle" apart without saying where it begins and ends, so the rule is the configuration's. A flight is
-//! inserted whole, hence the steps that led to a level-up are known when they are sorted into the two parts.
+//! The paper keeps "experience of avoiding an obstacle" apart without saying where it begins and
+//! ends, so the configuration decides. Episodes are inserted whole, hence the steps before a
+//! level-up are known when they are sorted into the two parts.
 
 use skein_protocol::config::{ReplaySection, SuccessRule};
 
-/// Which steps of a flight are success experience, `[steps]`.
+/// Marks the steps of an episode that are success experience, `[steps]`.
 ///
-/// `level_up`, `[steps]`: a wall was crossed or the destination reached in this step. None is where success experience has no part of its own.
+/// `level_up`, `[steps]`: `true` where the step crossed a wall or reached the destination. No step
+/// is marked where success experience has no part of its own.
 pub(super) fn success_steps(level_up: &[bool], section: &ReplaySection) -> Vec<bool> {
     if section.success_share == 0.0 {
         return vec![false; level_up.len()];
@@ -51,12 +53,12 @@ mod tests {
     }
 
     #[test]
-    fn an_approach_does_not_reach_before_take_off() {
+    fn an_approach_does_not_reach_before_reset() {
         assert_eq!(steps("X....", SuccessRule::Approach), "X....");
     }
 
     #[test]
-    fn a_flight_without_a_crossing_is_all_regular() {
+    fn an_episode_without_a_crossing_is_all_regular() {
         assert_eq!(steps(".....", SuccessRule::Approach), ".....");
     }
 }

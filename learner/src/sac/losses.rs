@@ -1,14 +1,17 @@
 //! The three objectives of soft actor-critic and the critic's targets, as plain functions.
 //!
-//! Equation numbers are those of arXiv:1812.05905. All expectations are means over the batch. What must not be differentiated, targets and the
-//! temperature outside of its own objective, is passed in detached.
+//! Equation numbers are those of arXiv:1812.05905. Every expectation is a mean over the batch.
+//! Callers detach whatever must not be differentiated: targets, and the temperature outside its own
+//! objective.
 
 use tch::Tensor;
 
-/// Soft Bellman targets, `[n]` (eq. 2 and 3): r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')), a' drawn from the policy.
+/// Soft Bellman targets, `[n]` (eq. 2 and 3), with a' drawn from the policy:
+/// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')).
 ///
-/// A flight that was cut off (truncated) is not terminated: its last state still has a future, and its value is bootstrapped.
-/// `rewards`, `terminated`, `next_values` (the smaller Q̄) and `next_log_prob`: `[n]`; `temperature`: α, `[1]`.
+/// A truncated episode is not terminated: its last state has a future, so its value is
+/// bootstrapped. `rewards`, `terminated`, `next_values` (the smaller Q̄) and `next_log_prob`:
+/// `[n]`; `temperature`: α, `[1]`.
 pub fn soft_targets(
     rewards: &Tensor,
     terminated: &Tensor,
@@ -22,19 +25,25 @@ pub fn soft_targets(
     rewards + continues * soft_values * discount
 }
 
-/// Half the squared distance of both estimates from the target, summed over the two (eq. 5). `values`: `[n, 2]`, `targets`: `[n]`.
+/// Half the squared error of both estimates against the target, summed over the two (eq. 5).
+/// `values`: `[n, 2]`, `targets`: `[n]`.
 pub fn critic_loss(values: &Tensor, targets: &Tensor) -> Tensor {
     (values - targets.unsqueeze(1)).square().sum(None) * (0.5 / targets.size()[0] as f64)
 }
 
-/// α log π(a | s) - min Q(s, a), a drawn from the policy (eq. 7). `log_prob`, `values` (the smaller Q): `[n]`; `temperature`: α, `[1]`.
+/// α log π(a | s) - min Q(s, a), with a drawn from the policy (eq. 7). `log_prob`, `values` (the
+/// smaller Q): `[n]`; `temperature`: α, `[1]`.
 pub fn policy_loss(log_prob: &Tensor, values: &Tensor, temperature: &Tensor) -> Tensor {
     (temperature * log_prob - values).mean(None)
 }
 
-/// -α (log π(a | s) + H̄) for log α (eq. 18): the temperature rises while the policy's entropy is below the target H̄. `log_temperature`: log α, `[1]`;
-/// `log_prob`: `[n]`, detached.
-pub fn temperature_loss(log_temperature: &Tensor, log_prob: &Tensor, target_entropy: f64) -> Tensor {
+/// -α (log π(a | s) + H̄), minimised over log α (eq. 18): the temperature rises while the policy's
+/// entropy is below the target H̄. `log_temperature`: log α, `[1]`; `log_prob`: `[n]`, detached.
+pub fn temperature_loss(
+    log_temperature: &Tensor,
+    log_prob: &Tensor,
+    target_entropy: f64,
+) -> Tensor {
     -(log_temperature.exp() * (log_prob + target_entropy)).mean(None)
 }
 
@@ -69,8 +78,9 @@ mod tests {
     }
 
     #[test]
-    fn truncated_flight_still_bootstraps() {
-        // The same last step twice: once the flight crashed, once its step limit cut it off. Only the crash has no future.
+    fn a_truncated_episode_still_bootstraps() {
+        // The same last step twice: one episode crashed, the other was cut off by its step limit.
+        // Only the crash has no future.
         let (crashed, truncated) = (1.0, 0.0);
         let targets = soft_targets(
             &numbers(&[-1.0, -1.0]),
@@ -94,7 +104,11 @@ mod tests {
     fn policy_loss_matches_hand_calculation() {
         // ((0.5 · 2 - 3) + (0.5 · -1 - 1)) / 2
         assert_close(
-            &policy_loss(&numbers(&[2.0, -1.0]), &numbers(&[3.0, 1.0]), &numbers(&[0.5])),
+            &policy_loss(
+                &numbers(&[2.0, -1.0]),
+                &numbers(&[3.0, 1.0]),
+                &numbers(&[0.5]),
+            ),
             &[-1.75],
         );
     }

@@ -1,7 +1,8 @@
 //! Soft actor-critic with learned temperature (Haarnoja et al. 2018, arXiv:1812.05905).
 //!
-//! Two engines do the same update: one on kernels of our own, one on libtorch. Parameters, noise, metrics and what a checkpoint holds are the same of both; sums round
-//! differently.
+//! Two engines compute the same update: [`NativeSac`] on Skein's own kernels, [`TorchSac`] on
+//! libtorch. Both share parameters, noise, metrics and the checkpoint's contents; only the rounding
+//! of sums differs. The equations stand once, as plain functions, in [`losses`].
 
 pub mod losses;
 mod native;
@@ -12,7 +13,7 @@ use crate::metrics::Scalar;
 pub use native::NativeSac;
 pub use torch::TorchSac;
 
-/// What an update reports. The temperature is that before it.
+/// Metrics that an update reports. The temperature is the value before the update.
 const REPORTED: [Scalar; 5] = [
     Scalar::CriticLoss,
     Scalar::PolicyLoss,
@@ -21,7 +22,7 @@ const REPORTED: [Scalar; 5] = [
     Scalar::MeanValue,
 ];
 
-/// `values`, in the order of [`REPORTED`], as points of their curves.
+/// Pairs `values`, in the order of [`REPORTED`], with their curves.
 fn reported(values: [f32; REPORTED.len()]) -> Vec<(Scalar, f32)> {
     REPORTED.into_iter().zip(values).collect()
 }

@@ -1,7 +1,16 @@
-//! One SAC update on the kernels, forward and backward written out, in reading order.
+//! One SAC update on the native kernels, forward and backward written out, in reading order.
 //!
-//! The same update as that of [`super::TorchSac`], which stays beside it as the reference: same parameters in the same order, same noise, same metrics. Every sum has one
-//! order, so the bits depend neither on the processor nor on how many threads there are. Memory is set aside once for a batch size and used again.
+//! It computes the same update as [`super::TorchSac`], which stays as the reference: same
+//! parameters in the same order, same noise, same metrics. Every sum has a fixed order, so its bits
+//! depend neither on the instruction set nor on the number of threads. Equality across types of
+//! processor is not promised: a few functions are the C library's (docs/reliability.md). Buffers
+//! are allocated once per batch size and reused.
+//!
+//! Equation numbers and symbols are those of arXiv:1812.05905:
+//! - s and s': states before and after the replayed action;
+//! - a and a': actions drawn from the policy in s and s';
+//! - Q and Q̄: critic and target critic, two estimates each;
+//! - α and H̄: temperature and target entropy; γ: discount.
 
 mod sample;
 
@@ -16,14 +25,14 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::{UpdateError, must_be_finite};
 use crate::metrics::Scalar;
 use crate::networks::native::{
-    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output, output_mut, pair, smaller,
-    squared_norm,
+    CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output,
+    output_mut, pair, smaller, squared_norm,
 };
 use crate::networks::{Critic, Layout, Policy};
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-/// Policy, critic, target critic and temperature, each with its optimizer.
+/// Policy, critic, target critic and temperature, each with its optimizer state.
 #[derive(Debug)]
 pub struct NativeSac {
     isa: Isa,
@@ -33,53 +42,65 @@ pub struct NativeSac {
     policy_parameters: Learned,
     critic: NativeCritic,
     critic_parameters: Learned,
-    /// Of a critic that follows the learned one slowly, and steadies the targets.
+    /// Parameters of the target critic Q̄: a slowly following average of the critic's, which
+    /// steadies the targets.
     target_parameters: Vec<f32>,
     /// log α, `[1]`.
     log_temperature: Learned,
     discount: f32,
     target_rate: f32,
     target_entropy: f32,
-    work: Work,
+    buffers: UpdateBuffers,
 }
 
-/// Everything computed on the way, kept from update to update.
+/// Buffers of one update, kept from update to update.
 #[derive(Debug, Default)]
-struct Work {
+struct UpdateBuffers {
     rows: usize,
-    /// The policy's, of states after the actions, then of states: `[2 rows, 4]`.
+    /// Policy network outputs, `[2 rows, 4]`: first for the next observations s', then for s.
     outputs: Vec<f32>,
+    /// Actions drawn from those outputs, and their log-probabilities: rows of s' first, then of s.
     sample: Sample,
-    /// The critic's states and actions side by side, `[rows, state + 2]`.
+    /// Critic input, `[rows, critic input + 2]`: states and actions side by side.
     joined: Vec<f32>,
-    /// The target's, `[rows, 2]`.
+    /// Target critic's two estimates of Q̄(s', a'), `[rows, 2]`.
     target_values: Vec<f32>,
-    /// Of the actions replayed, then of those drawn.
+    /// Critic activations: for the replayed actions, then overwritten by those for the drawn
+    /// actions.
     critic: CriticLayers,
-    /// Of the actions replayed.
-    critic_flowing: CriticLayers,
-    /// Of the values of the actions drawn, `[rows, 2]`.
-    drawn_flowing: Vec<f32>,
-    /// `[rows, 2]`.
+    /// Gradient of the critic loss with respect to the critic's activations, for the replayed
+    /// actions.
+    critic_grad: CriticLayers,
+    /// Gradient of the policy loss with respect to the two estimates of Q(s, a), `[rows, 2]`.
+    drawn_grad: Vec<f32>,
+    /// Gradient of the policy loss with respect to the drawn actions, through Q, `[rows, 2]`.
     action_gradient: Vec<f32>,
-    /// Of the states alone.
+    /// Policy activations for the current states s, `[rows, width]` per layer.
     policy: Layers,
-    policy_flowing: Layers,
+    /// Gradient of the policy loss with respect to those activations.
+    policy_grad: Layers,
 }
 
 impl NativeSac {
-    /// Untrained networks whose parameters depend on the run's seed alone.
+    /// Returns untrained networks; their parameters depend on the run's seed alone.
     ///
     /// # Panics
-    /// At the first update, when this machine lacks the instructions.
+    /// The first update panics when this machine lacks the instructions of `isa`.
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
         Policy::describe(&mut policy_layout, inputs.policy as i64, width);
-        let policy_values = policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
+        let policy_values =
+            policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(&mut critic_layout, inputs.critic as i64, width, section.critic_networks);
-        let critic_values = critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
+        Critic::describe(
+            &mut critic_layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
+        let critic_values =
+            critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
         Self {
             isa,
@@ -94,126 +115,173 @@ impl NativeSac {
             discount: section.discount as f32,
             target_rate: section.target_rate as f32,
             target_entropy: section.target_entropy.value() as f32,
-            work: Work::default(),
+            buffers: UpdateBuffers::default(),
         }
     }
 
-    /// Actions drawn from the present policy: in the states after the replayed actions, and in the states themselves.
+    /// Draws actions from the current policy: a' for the next observations, a for the observations.
     fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
         let policy = &self.policy_parameters.values;
-        let Work {
+        let UpdateBuffers {
             rows,
             outputs,
             sample,
-            policy: given,
+            policy: activations,
             ..
-        } = &mut self.work;
+        } = &mut self.buffers;
         let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * ACTION);
         self.policy
             .forward_through(team, policy, columns.next_observations, next_outputs);
-        self.policy.forward(team, policy, columns.observations, given);
-        state_outputs.copy_from_slice(output(given));
+        self.policy
+            .forward(team, policy, columns.observations, activations);
+        state_outputs.copy_from_slice(output(activations));
         noise.fill_normal(&mut sample.noise);
         sample.draw(self.isa, outputs);
     }
 
-    /// The critic's gradient: what the state after the action is worth says the slow critic (eq. 3), and both estimates are drawn towards
-    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')) (eq. 5). Returns the loss and the mean of the smaller estimate.
-    fn criticise(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
-        let Work {
+    /// Computes the critic's gradient: regresses both estimates on the soft Bellman target y.
+    ///
+    /// ```text
+    /// y = r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s'))      (eq. 3)
+    /// loss = ½ Σ (Q(s, replayed action) - y)², mean over the batch       (eq. 5)
+    /// ```
+    ///
+    /// Returns the loss and the mean of the smaller estimate.
+    fn critic_gradient(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        temperature: f32,
+    ) -> [f32; 2] {
+        let UpdateBuffers {
             rows,
             sample,
             joined,
             target_values,
-            critic: given,
-            critic_flowing,
+            critic: activations,
+            critic_grad,
             ..
-        } = &mut self.work;
-        let (next_actions, next_log_prob) = (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
+        } = &mut self.buffers;
+        let (next_actions, next_log_prob) =
+            (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
         join(columns.next_states, next_actions, joined);
         self.critic
             .forward_through(team, &self.target_parameters, joined, target_values);
 
         join(columns.states, columns.actions, joined);
         let critic = &self.critic_parameters.values;
-        self.critic.forward(team, critic, joined, given);
+        self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut value) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
-        let flowing = &mut critic_flowing.values;
+        let grad = &mut critic_grad.values;
         for row in 0..*rows {
             let soft_value = smaller(pair(target_values, row)) - temperature * next_log_prob[row];
-            let target = columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
-            let values = pair(&given.values, row);
-            for (value, flowing) in values.iter().zip(&mut flowing[row * ESTIMATES..]) {
+            let target =
+                columns.rewards[row] + (1.0 - columns.terminated[row]) * soft_value * self.discount;
+            let values = pair(&activations.values, row);
+            for (value, grad) in values.iter().zip(&mut grad[row * ESTIMATES..]) {
                 let error = value - target;
                 loss += 0.5 * f64::from(error * error);
-                *flowing = error * share;
+                *grad = error * share;
             }
             value += f64::from(smaller(values));
         }
         let into = &mut self.critic_parameters.gradient;
-        self.critic.gradient(team, critic, joined, given, critic_flowing, into);
+        self.critic
+            .gradient(team, critic, joined, activations, critic_grad, into);
         [loss, value].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// The policy's gradient: it moves towards actions of higher value, as far as its entropy is worth less: (α log π(a | s) - min Q(s, a)) is to fall (eq. 7). Returns the mean of
-    /// that, and of log π.
-    fn improve(&mut self, team: &mut Team, columns: Columns<'_>, temperature: f32) -> [f32; 2] {
-        let Work {
+    /// Computes the policy's gradient: makes actions of higher value likelier, at a price for lost
+    /// entropy.
+    ///
+    /// ```text
+    /// loss = α log π(a | s) - min Q(s, a), mean over the batch           (eq. 7)
+    /// ```
+    ///
+    /// Returns the loss and the mean of log π.
+    fn policy_gradient(
+        &mut self,
+        team: &mut Team,
+        columns: Columns<'_>,
+        temperature: f32,
+    ) -> [f32; 2] {
+        let UpdateBuffers {
             rows,
             sample,
             joined,
-            critic: given,
-            drawn_flowing,
+            critic: activations,
+            drawn_grad,
             action_gradient,
-            policy: policy_given,
-            policy_flowing,
+            policy: policy_activations,
+            policy_grad,
             ..
-        } = &mut self.work;
-        let (policy, critic) = (&self.policy_parameters.values, &self.critic_parameters.values);
+        } = &mut self.buffers;
+        let (policy, critic) = (
+            &self.policy_parameters.values,
+            &self.critic_parameters.values,
+        );
         let (actions, log_prob) = (&sample.actions[*rows * ACTION..], &sample.log_prob[*rows..]);
         join(columns.states, actions, joined);
-        self.critic.forward(team, critic, joined, given);
+        self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut log_prob_sum) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
         for (row, &log_prob) in log_prob.iter().enumerate() {
-            let values = pair(&given.values, row);
+            let values = pair(&activations.values, row);
             log_prob_sum += f64::from(log_prob);
             loss += f64::from(temperature * log_prob - smaller(values));
-            drawn_flowing[row * ESTIMATES..][..ESTIMATES]
+            drawn_grad[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
         let action = self.inputs.critic..self.inputs.critic + ACTION;
-        self.critic
-            .backward_through(team, critic, given, drawn_flowing, action, action_gradient);
-        // Back through the drawing and the policy.
-        sample.backward(*rows, temperature * share, action_gradient, output_mut(policy_flowing));
-        self.policy.backward(team, policy, policy_given, policy_flowing);
-        let into = &mut self.policy_parameters.gradient;
+        self.critic.backward_through(
+            team,
+            critic,
+            activations,
+            drawn_grad,
+            action,
+            action_gradient,
+        );
+        // Back through the drawn actions, then through the policy.
+        sample.backward(
+            *rows,
+            temperature * share,
+            action_gradient,
+            output_mut(policy_grad),
+        );
         self.policy
-            .gradient(team, columns.observations, policy_given, policy_flowing, into);
+            .backward(team, policy, policy_activations, policy_grad);
+        let into = &mut self.policy_parameters.gradient;
+        self.policy.gradient(
+            team,
+            columns.observations,
+            policy_activations,
+            policy_grad,
+            into,
+        );
         [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
     }
 
-    /// Places for everything that an update of so many rows computes.
-    fn places(&self, rows: usize) -> Work {
+    /// Allocates the buffers for an update of `rows` transitions.
+    fn allocate(&self, rows: usize) -> UpdateBuffers {
         let numbers = |rows: usize, width: usize| vec![0.0; rows * width];
-        Work {
+        UpdateBuffers {
             rows,
             outputs: numbers(2 * rows, 2 * ACTION),
-            sample: Sample::places(2 * rows),
+            sample: Sample::allocate(2 * rows),
             joined: numbers(rows, self.inputs.critic + ACTION),
             target_values: numbers(rows, ESTIMATES),
-            critic: self.critic.places(rows),
-            critic_flowing: self.critic.places(rows),
-            drawn_flowing: numbers(rows, ESTIMATES),
+            critic: self.critic.allocate(rows),
+            critic_grad: self.critic.allocate(rows),
+            drawn_grad: numbers(rows, ESTIMATES),
             action_gradient: numbers(rows, ACTION),
-            policy: self.policy.places(rows),
-            policy_flowing: self.policy.places(rows),
+            policy: self.policy.allocate(rows),
+            policy_grad: self.policy.allocate(rows),
         }
     }
 
-    /// Looks whether what an update reports and the gradients it took are numbers. Of a gradient, the square of its length has to be.
+    /// Checks that the reported values and the gradients are finite; for a gradient, that its
+    /// squared norm is.
     fn check(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
         let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
@@ -230,20 +298,24 @@ impl NativeSac {
         must_be_finite(self.updates() + 1, numbers)
     }
 
-    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * ACTION];
         let policy = &self.policy_parameters.values;
         self.policy
             .forward_through(&mut Team::new(1), policy, observations, &mut outputs);
-        let means = outputs.chunks_exact(2 * ACTION).flat_map(|row| &row[..ACTION]);
+        let means = outputs
+            .chunks_exact(2 * ACTION)
+            .flat_map(|row| &row[..ACTION]);
         means.map(|mean| mean.tanh()).collect()
     }
 }
 
 impl Algorithm for NativeSac {
-    /// One step of critic, policy and temperature, and of the target behind them. All three gradients are taken at the same parameters before any of them moves: an update is done
-    /// whole or not at all.
+    /// Makes one step of critic, policy and temperature, then moves the target critic.
+    ///
+    /// All three gradients are taken at the same parameters before any of them moves, so an update
+    /// happens whole or not at all.
     ///
     /// Source: arXiv:1812.05905, algorithm 1.
     fn update(
@@ -253,14 +325,15 @@ impl Algorithm for NativeSac {
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
         let rows = columns.check(self.inputs);
-        if self.work.rows != rows {
-            self.work = self.places(rows);
+        if self.buffers.rows != rows {
+            self.buffers = self.allocate(rows);
         }
         let temperature = exp(self.log_temperature.values[0]);
         self.draw(team, columns, noise);
-        let [critic_loss, mean_value] = self.criticise(team, columns, temperature);
-        let [policy_loss, log_prob] = self.improve(team, columns, temperature);
-        // The temperature rises while the policy is more certain than asked for, and falls otherwise: the gradient of -α (log π + H̄) by log α is itself (eq. 18).
+        let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
+        let [policy_loss, log_prob] = self.policy_gradient(team, columns, temperature);
+        // The derivative of -α (log π + H̄) by log α is the expression itself (eq. 18). The
+        // temperature rises while the entropy is below its target, and falls otherwise.
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 
         let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
@@ -290,20 +363,25 @@ impl Algorithm for NativeSac {
 }
 
 impl Stateful for NativeSac {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        let mut parts = self.policy_parameters.parts("sac.policy.parameters", "sac.policy.adam");
-        parts.extend(self.critic_parameters.parts("sac.critic.parameters", "sac.critic.adam"));
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
+        let mut parts = self
+            .policy_parameters
+            .parts("sac.policy.parameters", "sac.policy.adam");
+        parts.extend(
+            self.critic_parameters
+                .parts("sac.critic.parameters", "sac.critic.adam"),
+        );
         parts.extend(
             self.log_temperature
                 .parts("sac.log_temperature", "sac.temperature.adam"),
         );
-        let target = Part::Numbers(&mut self.target_parameters);
+        let target = StatePart::Numbers(&mut self.target_parameters);
         parts.push(("sac.target.parameters".to_owned(), target));
         parts
     }
 }
 
-/// Derivative of the smaller estimate by both: equal ones share it.
+/// Derivative of the smaller estimate by both estimates. Equal ones share it, as in libtorch.
 fn share_of_smaller([one, other]: [f32; ESTIMATES]) -> [f32; ESTIMATES] {
     if one < other {
         [1.0, 0.0]

@@ -1,7 +1,7 @@
-//! The whole update, on both engines: exactness, determinism, and that it learns.
+//! The whole update on both engines: exactness, determinism, and that it learns.
 
 use skein_kernels::{Isa, Team};
-use skein_protocol::config::{Engine, Observation, SacSection, View};
+use skein_protocol::config::{Engine, Observation, ObservationLayout, SacSection};
 use skein_protocol::snapshot::SnapshotLayout;
 use tch::{Device, Tensor, no_grad_guard};
 
@@ -14,7 +14,7 @@ use crate::networks::{Layout, Parameters, Policy};
 use crate::noise::Noise;
 use crate::state::{NamedTensor, TensorValues};
 
-/// Numbers in an observation.
+/// Width of an observation.
 const OBSERVATION: usize = 32;
 pub(super) const ENGINES: [Engine; 2] = [Engine::Native, Engine::Libtorch];
 
@@ -37,14 +37,25 @@ fn sac(engine: Engine, section: &SacSection, seed: u64) -> Box<dyn Algorithm> {
 
 type Metrics = Vec<(Scalar, f32)>;
 
-fn update(sac: &mut dyn Algorithm, transitions: &Transitions, noise: &mut Noise) -> Result<Metrics, UpdateError> {
+fn update(
+    sac: &mut dyn Algorithm,
+    transitions: &Transitions,
+    noise: &mut Noise,
+) -> Result<Metrics, UpdateError> {
     sac.update(&mut Team::new(1), transitions.columns(), noise)
 }
 
 fn train(sac: &mut dyn Algorithm, updates: usize, seed: u64) -> Vec<Metrics> {
     let (mut data, mut noise) = (Noise::new(seed), Noise::new(seed + 1));
     (0..updates)
-        .map(|_| update(sac, &Transitions::guessing(OBSERVATION, 32, &mut data), &mut noise).unwrap())
+        .map(|_| {
+            update(
+                sac,
+                &Transitions::one_step_task(OBSERVATION, 32, &mut data),
+                &mut noise,
+            )
+            .unwrap()
+        })
         .collect()
 }
 
@@ -58,13 +69,15 @@ fn published(sac: &dyn Algorithm) -> Vec<f32> {
     published
 }
 
-/// What the published policy does without noise, `[n, 2]`.
+/// The published policy's action without noise, `[n, 2]`.
 fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<f32> {
     let mut layout = Layout::default();
     let policy = Policy::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
     let _guard = no_grad_guard();
-    parameters.flat_mut().copy_(&Tensor::from_slice(&published(sac)));
+    parameters
+        .flat_mut()
+        .copy_(&Tensor::from_slice(&published(sac)));
     let observations = Tensor::from_slice(observations).view([-1, OBSERVATION as i64]);
     Vec::try_from(policy.mode(&parameters, &observations).reshape([-1])).unwrap()
 }
@@ -112,7 +125,7 @@ fn an_update_that_is_not_finite_changes_nothing() {
         let mut sac = sac(engine, &small(), 1);
         train(&mut *sac, 3, 5);
         let before = state(&mut *sac);
-        let sound = Transitions::guessing(OBSERVATION, 32, &mut Noise::new(1));
+        let sound = Transitions::one_step_task(OBSERVATION, 32, &mut Noise::new(1));
         let mut refused = |damage: fn(&mut Transitions)| {
             let mut damaged = sound.clone();
             damage(&mut damaged);
@@ -121,29 +134,43 @@ fn an_update_that_is_not_finite_changes_nothing() {
             error
         };
         let of = |tensor| UpdateError::NonFinite { tensor, update: 4 };
-        assert_eq!(refused(|batch| batch.rewards[4] = f32::NAN), of("critic loss"));
-        assert_eq!(refused(|batch| batch.rewards[31] = f32::INFINITY), of("critic loss"));
-        assert_eq!(refused(|batch| batch.observations[7] = f32::NAN), of("critic loss"));
-        // Squared, they are still numbers; the square of a gradient's length no longer is.
+        assert_eq!(
+            refused(|batch| batch.rewards[4] = f32::NAN),
+            of("critic loss")
+        );
+        assert_eq!(
+            refused(|batch| batch.rewards[31] = f32::INFINITY),
+            of("critic loss")
+        );
+        assert_eq!(
+            refused(|batch| batch.observations[7] = f32::NAN),
+            of("critic loss")
+        );
+        // Their squares are still finite; the gradient's squared norm is not.
         let UpdateError::NonFinite { tensor, .. } = refused(|batch| batch.rewards.fill(1.5e19));
         assert!(tensor.starts_with("critic"), "{engine}: {tensor}");
     }
 }
 
 #[test]
-fn truncated_flight_still_bootstraps() {
+fn a_truncated_episode_still_bootstraps() {
     for engine in ENGINES {
-        // What the critic learns of one transition, the last of its flight, when the state after it is another.
+        // Metrics after learning from one transition, the last of its episode, for a given next
+        // state.
         let learned = |terminated: f32, next: f32| {
             let mut sac = sac(engine, &small(), 1);
-            let mut last = Transitions::guessing(OBSERVATION, 1, &mut Noise::new(1));
+            let mut last = Transitions::one_step_task(OBSERVATION, 1, &mut Noise::new(1));
             last.terminated[0] = terminated;
             last.next_observations.fill(next);
             let metrics = update(&mut *sac, &last, &mut Noise::new(2)).unwrap();
             metrics[0]
         };
         let (crashed, truncated) = (1.0, 0.0);
-        assert_eq!(learned(crashed, 0.1), learned(crashed, -0.7), "a crash has no future");
+        assert_eq!(
+            learned(crashed, 0.1),
+            learned(crashed, -0.7),
+            "a crash has no future"
+        );
         assert_ne!(
             learned(truncated, 0.1),
             learned(truncated, -0.7),
@@ -156,7 +183,10 @@ fn truncated_flight_still_bootstraps() {
 fn the_published_part_is_the_snapshots_policy() {
     for engine in ENGINES {
         let mut sac = sac(engine, &small(), 1);
-        let layout = SnapshotLayout::new(&View::present(Observation::Latent, OBSERVATION), 32);
+        let layout = SnapshotLayout::new(
+            &ObservationLayout::present(Observation::Latent, OBSERVATION),
+            32,
+        );
         assert_eq!(layout.policy().len(), sac.policy_layout().len());
         let policys = layout
             .tensors()
@@ -191,12 +221,14 @@ fn the_right_action_is_learned_in_a_one_step_task() {
         for seed in 1..=3 {
             let mut sac = sac(engine, &section, seed);
             train(&mut *sac, 600, seed);
-            let test = Transitions::guessing(OBSERVATION, 256, &mut Noise::new(seed + 100));
+            let test = Transitions::one_step_task(OBSERVATION, 256, &mut Noise::new(seed + 100));
             let actions = mode(&*sac, &section, &test.observations);
             let observations = test.observations.chunks_exact(OBSERVATION);
             let squared = observations
                 .zip(actions.chunks_exact(2))
-                .map(|(wanted, done)| (wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2));
+                .map(|(wanted, done)| {
+                    (wanted[0] - done[0]).powi(2) + (wanted[1] - done[1]).powi(2)
+                });
             let error = squared.sum::<f32>() / actions.len() as f32;
             // Always answering zero has a mean squared error of 0.8² / 3 = 0.21.
             assert!(error < 0.03, "{engine}, seed {seed}: {error}");

@@ -1,4 +1,5 @@
-//! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the way to a CUDA device.
+//! One SAC update with libtorch's automatic gradients, in reading order: the reference, and the
+//! engine for CUDA devices.
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
@@ -9,14 +10,14 @@ use tch::{Device, Tensor, no_grad_guard};
 use super::losses::{critic_loss, policy_loss, soft_targets, temperature_loss};
 use super::reported;
 use crate::algorithm::{Algorithm, Columns, Inputs};
-use crate::batch::Batch;
+use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
 use crate::networks::{Critic, Layout, Parameters, Policy, PolicySample};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::perception::{LooksAhead, Perception};
-use crate::state::{Part, Stateful};
+use crate::perception::{NextStateEncoder, Perception};
+use crate::state::{StatePart, Stateful};
 
 /// Policy, critic, target critic and temperature, each with its optimizer.
 #[derive(Debug)]
@@ -25,12 +26,13 @@ pub struct TorchSac {
     policy: Policy,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
-    /// Where the encoder is trained end to end: its parameters lie before the critic's.
+    /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
     critic: Critic,
     critic_parameters: Parameters,
     critic_optimizer: Adam,
-    /// A critic that follows the learned one slowly, and steadies the targets.
+    /// Parameters of the target critic Q̄: a slowly following average of the critic's, which
+    /// steadies the targets.
     target_parameters: Parameters,
     /// log α, `[1]`.
     log_temperature: Tensor,
@@ -41,18 +43,31 @@ pub struct TorchSac {
 }
 
 impl TorchSac {
-    /// Untrained networks whose parameters depend on the run's seed alone.
+    /// Returns untrained networks; their parameters depend on the run's seed alone.
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
         let policy = Policy::describe(&mut layout, inputs.policy as i64, width);
-        let policy_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 0), device);
+        let policy_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 0),
+            device,
+        );
         let mut layout = Layout::default();
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = Critic::describe(&mut layout, inputs.critic as i64, width, section.critic_networks);
-        let critic_parameters = Parameters::initialise(layout, derive(run_seed, Purpose::PolicyParameters, 1), device);
+        let critic = Critic::describe(
+            &mut layout,
+            inputs.critic as i64,
+            width,
+            section.critic_networks,
+        );
+        let critic_parameters = Parameters::initialise(
+            layout,
+            derive(run_seed, Purpose::PolicyParameters, 1),
+            device,
+        );
         let log_temperature = Tensor::from_slice(&[section.initial_temperature.ln() as f32])
             .to_device(device)
             .set_requires_grad(true);
@@ -74,19 +89,24 @@ impl TorchSac {
         }
     }
 
-    /// Actions drawn from the present policy, and how likely they were.
+    /// Draws actions from the current policy, with their log-probabilities.
     fn draw(&self, observations: &Tensor, noise: &mut Noise) -> PolicySample {
-        let noise = noise.normal(&[observations.size()[0], ACTION as i64], self.log_temperature.device());
-        self.policy.sample(&self.policy_parameters, observations, &noise)
+        let noise = noise.normal(
+            &[observations.size()[0], ACTION as i64],
+            self.log_temperature.device(),
+        );
+        self.policy
+            .sample(&self.policy_parameters, observations, &noise)
     }
 
-    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')): what the state after the action is worth, by the slow critic and under the present policy (eq. 3), `[n]`.
-    fn targets(&self, batch: &Batch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
+    /// Soft Bellman targets, `[n]` (eq. 3), with a' drawn from the current policy:
+    /// r + γ (1 - terminated) (min Q̄(s', a') - α log π(a' | s')).
+    fn targets(&self, batch: &TensorBatch, temperature: &Tensor, noise: &mut Noise) -> Tensor {
         let _guard = no_grad_guard();
         let next = self.draw(&batch.next_observations, noise);
-        let next_values = self
-            .critic
-            .smaller(&self.target_parameters, &batch.next_states, &next.actions);
+        let next_values =
+            self.critic
+                .smaller(&self.target_parameters, &batch.next_states, &next.actions);
         soft_targets(
             &batch.rewards,
             &batch.terminated,
@@ -97,7 +117,7 @@ impl TorchSac {
         )
     }
 
-    /// The policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let _guard = no_grad_guard();
         let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);
@@ -110,21 +130,21 @@ impl TorchSac {
 }
 
 impl Algorithm for TorchSac {
-    /// As [`super::NativeSac`]'s. libtorch has threads of its own and leaves `team` alone.
+    /// Same update as [`super::NativeSac`]'s. libtorch has its own threads and leaves `team` alone.
     fn update(
         &mut self,
         _team: &mut Team,
         columns: Columns<'_>,
         noise: &mut Noise,
     ) -> Result<Vec<(Scalar, f32)>, UpdateError> {
-        let mut batch = Batch::new(columns, self.inputs, self.log_temperature.device());
+        let mut batch = TensorBatch::new(columns, self.inputs, self.log_temperature.device());
         if let Some(perception) = &self.perception {
             let (critic, target) = (&self.critic_parameters, &self.target_parameters);
-            perception.look(&mut batch, critic, target, LooksAhead::Learned);
+            perception.encode(&mut batch, critic, target, NextStateEncoder::Learned);
         }
         let temperature = self.log_temperature.detach().exp();
 
-        // Both estimates are drawn towards their target (eq. 5).
+        // Critic: regress both estimates on their target (eq. 5).
         let targets = self.targets(&batch, &temperature, noise);
         let values = self
             .critic
@@ -132,19 +152,23 @@ impl Algorithm for TorchSac {
         let critic_loss = critic_loss(&values, &targets);
         let critic_gradient = self.critic_parameters.gradient(&critic_loss);
 
-        // The policy moves towards actions of higher value, as far as its entropy is worth less (eq. 7).
+        // Policy: minimise α log π(a | s) - min Q(s, a) (eq. 7).
         let drawn = self.draw(&batch.observations, noise);
-        let drawn_values = self
-            .critic
-            .smaller(&self.critic_parameters, &batch.states.detach(), &drawn.actions);
+        let drawn_values = self.critic.smaller(
+            &self.critic_parameters,
+            &batch.states.detach(),
+            &drawn.actions,
+        );
         let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
         let policy_gradient = self.policy_parameters.gradient(&policy_loss);
 
-        // The temperature rises while the policy is more certain than asked for, and falls otherwise (eq. 18).
+        // Temperature: rises while the entropy is below its target, falls otherwise (eq. 18).
         let log_prob = drawn.log_prob.detach();
-        let temperature_loss = temperature_loss(&self.log_temperature, &log_prob, self.target_entropy);
+        let temperature_loss =
+            temperature_loss(&self.log_temperature, &log_prob, self.target_entropy);
         let temperature_gradient =
-            Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false).remove(0);
+            Tensor::run_backward(&[&temperature_loss], &[&self.log_temperature], false, false)
+                .remove(0);
 
         let metrics = finite(
             self.updates() + 1,
@@ -167,7 +191,8 @@ impl Algorithm for TorchSac {
             .step(self.policy_parameters.flat_mut(), &policy_gradient);
         self.temperature_optimizer
             .step(&mut self.log_temperature, &temperature_gradient);
-        self.target_parameters.follow(&self.critic_parameters, self.target_rate);
+        self.target_parameters
+            .follow(&self.critic_parameters, self.target_rate);
         Ok(reported(metrics))
     }
 
@@ -180,7 +205,8 @@ impl Algorithm for TorchSac {
     }
 
     fn publish(&self, into: &mut [f32]) {
-        self.policy_parameters.copy_range(0..self.policy_layout().len(), into);
+        self.policy_parameters
+            .copy_range(0..self.policy_layout().len(), into);
     }
 
     fn publish_encoder(&self, into: &mut [f32]) {
@@ -191,14 +217,23 @@ impl Algorithm for TorchSac {
 }
 
 impl Stateful for TorchSac {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let own = [
-            ("sac.policy.parameters", self.policy_parameters.flat().shallow_clone()),
-            ("sac.critic.parameters", self.critic_parameters.flat().shallow_clone()),
-            ("sac.target.parameters", self.target_parameters.flat().shallow_clone()),
+            (
+                "sac.policy.parameters",
+                self.policy_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.critic.parameters",
+                self.critic_parameters.flat().shallow_clone(),
+            ),
+            (
+                "sac.target.parameters",
+                self.target_parameters.flat().shallow_clone(),
+            ),
             ("sac.log_temperature", self.log_temperature.detach()),
         ];
-        let own = own.map(|(name, tensor)| (name.to_owned(), Part::Tensor(tensor)));
+        let own = own.map(|(name, tensor)| (name.to_owned(), StatePart::Tensor(tensor)));
         let mut parts = Vec::from(own);
         parts.extend(self.policy_optimizer.parts("sac.policy.adam"));
         parts.extend(self.critic_optimizer.parts("sac.critic.adam"));

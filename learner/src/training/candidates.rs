@@ -1,84 +1,106 @@
-//! Evaluation flights in a run: those that confirm a candidate for the best snapshot, and those that show in the end what it can do.
+//! Confirmation episodes, which judge candidates for the best snapshot, and the final evaluation of
+//! the best one.
 
 use std::ops::Range;
 
-use skein_protocol::fault::{FaultPoint, pass};
 use skein_protocol::ids::{Epoch, PolicyVersion};
-use skein_protocol::progress::Phase;
+use skein_protocol::progress::LearnerPhase;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Ticket;
+use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate};
 use crate::checkpoint::BestSnapshot;
 use crate::curriculum;
+use crate::episode::CommittedEpisode;
+use crate::episodes::assembly::KeptData;
 use crate::evaluation;
-use crate::flight::CommittedFlight;
-use crate::flights::assembly::Keep;
 use crate::metrics::Scalar;
 
 impl Training<'_> {
-    /// Confirms the newest snapshot by evaluation flights if it is a candidate; keeps it if it is the best. The last one always is a candidate.
+    /// Confirms the newest snapshot if it is a candidate, and keeps it if it is the best so far.
+    /// The last snapshot always is a candidate.
     ///
-    /// It depends on the state alone and does nothing the second time: a run that was stopped here looks again when it is resumed.
-    pub(super) fn look_for_best(&mut self) -> Result<(), TrainingError> {
+    /// The result depends on the state alone, and a second call does nothing: a run stopped here
+    /// repeats it when resumed.
+    pub(super) fn confirm_if_candidate(&mut self) -> Result<(), TrainingError> {
         if !self.is_candidate() {
             return Ok(());
         }
         let version = self.progress.version();
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::confirmation(self.config, run, number, version);
-        let flown = self.evaluate(tickets, Keep::Latents)?;
-        pass(FaultPoint::LearnerCandidateFlown);
+        let flown = self.evaluate(tickets, KeptData::Latents)?;
+        die_if_armed(FaultPoint::LearnerCandidateFlown);
         self.note_trained(&flown);
-        let passed: f64 = flown.iter().map(|flight| f64::from(flight.walls_passed)).sum();
+        let passed: f64 = flown
+            .iter()
+            .map(|episode| f64::from(episode.walls_passed))
+            .sum();
         let candidate = BestSnapshot {
             policy_version: version.0,
-            flights: self.progress.flights,
-            window_walls_passed: self.metrics.windows().walls_passed.mean().unwrap_or_default(),
+            episodes: self.progress.episodes,
+            window_walls_passed: self
+                .metrics
+                .windows()
+                .walls_passed
+                .mean()
+                .unwrap_or_default(),
             confirmed_walls_passed: passed / flown.len() as f64,
         };
         self.metrics.scalars(
-            self.last_flight(),
-            &[(Scalar::EvaluationWallsPassed, candidate.confirmed_walls_passed)],
+            self.last_episode(),
+            &[(
+                Scalar::EvaluationWallsPassed,
+                candidate.confirmed_walls_passed,
+            )],
         )?;
         let best = self.progress.best.as_ref();
         tracing::info!(
             version = candidate.policy_version,
-            flights = candidate.flights,
+            episodes = candidate.episodes,
             walls_passed = candidate.confirmed_walls_passed,
             window_walls_passed = candidate.window_walls_passed,
             best_version = best.map(|best| best.policy_version),
             best_walls_passed = best.map(|best| best.confirmed_walls_passed),
             "candidate for the best snapshot flown"
         );
-        self.progress.latest_candidate = Some(self.progress.flights);
+        self.progress.latest_candidate = Some(self.progress.episodes);
         if is_better(&candidate, best) {
             self.progress.best = Some(candidate);
             self.save_snapshot(version, &self.directory.best_snapshot())?;
-            pass(FaultPoint::LearnerBestSaved);
+            die_if_armed(FaultPoint::LearnerBestSaved);
         }
         Ok(())
     }
 
-    /// Writes down what it took, the first time that `flown` show a policy that does what it was trained for.
-    fn note_trained(&mut self, flown: &[CommittedFlight]) {
-        let sum = |of: fn(&CommittedFlight) -> u8| flown.iter().map(|flight| f64::from(of(flight))).sum::<f64>();
-        let rate = sum(|flight| flight.walls_passed) / sum(|flight| flight.course_walls);
+    /// Records the effort of training, the first time that `flown` reach the configured success
+    /// rate.
+    pub(super) fn note_trained(&mut self, flown: &[CommittedEpisode]) {
+        let sum = |of: fn(&CommittedEpisode) -> u8| {
+            flown
+                .iter()
+                .map(|episode| f64::from(of(episode)))
+                .sum::<f64>()
+        };
+        let rate = sum(|episode| episode.walls_passed) / sum(|episode| episode.course_walls);
         if self.progress.trained.is_some() || rate < self.config.evaluation.trained_rate {
             return;
         }
         let trained = Trained {
             rate,
-            flights: self.progress.flights,
+            confirmation_episodes: flown.len() as u64,
+            episodes: self.progress.episodes,
             steps: self.trainer.steps(),
             updates: self.trainer.updates(),
             wall_secs: self.progress.spent.wall_secs + self.started.elapsed().as_secs_f64(),
         };
         tracing::info!(
             rate,
-            flights = trained.flights,
+            confirmation_episodes = trained.confirmation_episodes,
+            episodes = trained.episodes,
             steps = trained.steps,
             secs = trained.wall_secs,
             "trained"
@@ -86,54 +108,63 @@ impl Training<'_> {
         self.progress.trained = Some(trained);
     }
 
-    fn is_candidate(&self) -> bool {
+    pub(super) fn is_candidate(&self) -> bool {
         let progress = &self.progress;
-        let last = progress.flights == self.config.run.flights && progress.latest_candidate != Some(progress.flights);
+        let last = progress.episodes == self.config.run.episodes
+            && progress.latest_candidate != Some(progress.episodes);
         last || is_candidate(
             &self.config.evaluation,
-            progress.flights,
+            progress.episodes,
             progress.latest_candidate,
             &self.metrics.windows().walls_passed,
             progress.best.as_ref(),
         )
     }
 
-    /// Flies `flights` evaluation flights on each of `courses` with a published snapshot.
+    /// Flies `episodes` evaluation episodes on each of `courses` with a published snapshot.
     fn evaluate_on(
         &mut self,
         version: PolicyVersion,
         courses: Range<u32>,
-        flights: u64,
-        keep: Keep,
-    ) -> Result<Vec<CommittedFlight>, TrainingError> {
+        episodes: u64,
+        keep: KeptData,
+    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
-        let tickets = curriculum::evaluation(self.config, run, number, version, courses, flights);
+        let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
         self.evaluate(tickets, keep)
     }
 
     /// Flies `tickets` of the next evaluation, whose snapshot is published.
-    fn evaluate(&mut self, tickets: Vec<Ticket>, keep: Keep) -> Result<Vec<CommittedFlight>, TrainingError> {
+    fn evaluate(
+        &mut self,
+        tickets: Vec<Ticket>,
+        keep: KeptData,
+    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
         let total = tickets.len() as u64;
         self.reporter.update(|progress| {
-            progress.phase = Phase::Evaluating;
-            progress.evaluation_flights = (0, total);
+            progress.phase = LearnerPhase::Evaluating;
+            progress.evaluation_episodes = (0, total);
         });
-        let mut batch = self.reception.fly(Epoch(self.progress.epochs), keep, tickets)?;
+        let mut batch = self
+            .receiver
+            .fly(Epoch(self.progress.epochs), keep, tickets)?;
         let mut flown = Vec::with_capacity(batch.remaining());
-        while let Some(flight) = batch.next(self.stop)? {
-            self.reporter.update(|progress| progress.evaluation_flights.0 += 1);
-            flown.push(flight);
+        while let Some(episode) = batch.next(self.stop)? {
+            self.reporter
+                .update(|progress| progress.evaluation_episodes.0 += 1);
+            flown.push(episode);
         }
         self.progress.evaluations += 1;
-        self.progress.evaluation_flights += total;
+        self.progress.evaluation_episodes += total;
         self.timer.lap(Stage::Evaluate, total);
         Ok(flown)
     }
 
-    /// Evaluates the best snapshot on all courses and writes what came of it.
+    /// Evaluates the best snapshot on all courses and writes the report.
     pub(super) fn evaluate_best(&mut self) -> Result<(), TrainingError> {
-        // The last snapshot was a candidate, and the first candidate is the best: there is one.
+        // Never missing: the last snapshot was a candidate, and the first candidate becomes the
+        // best.
         let Some(version) = self
             .progress
             .best
@@ -144,11 +175,16 @@ impl Training<'_> {
         };
         let best = self.kept_snapshot(version)?;
         let sha256 = best.sha256();
-        self.reception.publish(best)?;
+        self.receiver.publish(best)?;
         let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate_on(version, 0..courses, self.config.evaluation.flights, Keep::Latents)?;
-        let pictured = self.evaluate_on(version, 0..1, 1, Keep::Depth)?;
-        pass(FaultPoint::LearnerEvaluated);
+        let flown = self.evaluate_on(
+            version,
+            0..courses,
+            self.config.evaluation.episodes,
+            KeptData::Latents,
+        )?;
+        let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
+        die_if_armed(FaultPoint::LearnerEvaluated);
         Ok(self.disk.with_room(self.directory.root(), || {
             evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
             evaluation::write_reconstructions(self.directory, &mut self.trainer, &pictured)

@@ -1,36 +1,44 @@
-//! What the curves of an epoch are drawn from, gathered over its legs and told at its end.
+//! The points of an epoch's curves, gathered over its segments and written at its end.
 
 use std::time::Duration;
 
-use crate::flights::reception::Shared;
-use crate::metrics::Scalar;
+use crate::faults::Faults;
+use crate::metrics::{Scalar, fault_points};
 use crate::replay::Replay;
-use crate::trainer::Means;
+use crate::trainer::MetricMeans;
 use crate::vae::VaeMetrics;
 
-/// What an epoch brought so far.
+/// Results of an epoch so far.
 #[derive(Debug, Default)]
 pub(super) struct EpochCurves {
-    /// Steps taken in.
+    /// Steps learned from.
     pub(super) steps: usize,
-    /// Of the last step of the VAE, if there was one.
+    /// Metrics of the last VAE step, if there was one.
     pub(super) vae: Option<VaeMetrics>,
-    /// Of the policy's updates.
-    pub(super) policy: Means,
+    /// MetricMeans of the policy updates' metrics.
+    pub(super) policy: MetricMeans,
     pub(super) updates: u64,
-    /// Time for the updates.
+    /// Time spent on the updates.
     pub(super) updating: Duration,
 }
 
 impl EpochCurves {
-    /// The points of an epoch that took so `long`.
-    pub(super) fn points(self, long: Duration, replay: &Replay, reception: &Shared) -> Vec<(Scalar, f64)> {
+    /// Returns the points of an epoch that took `duration`.
+    pub(super) fn points(
+        self,
+        duration: Duration,
+        replay: &Replay,
+        faults: &Faults,
+    ) -> Vec<(Scalar, f64)> {
         let mut points = vec![
             (Scalar::ReplayTransitions, replay.len() as f64),
             (Scalar::ReplaySuccess, replay.success_len() as f64),
-            (Scalar::StepsPerSec, self.steps as f64 / long.as_secs_f64()),
+            (
+                Scalar::StepsPerSec,
+                self.steps as f64 / duration.as_secs_f64(),
+            ),
         ];
-        points.extend(reception.faults().scalars());
+        points.extend(fault_points(faults));
         if let Some(vae) = self.vae {
             points.extend([
                 (Scalar::VaeLoss, vae.loss.into()),
@@ -40,7 +48,10 @@ impl EpochCurves {
         }
         if self.updates > 0 {
             points.extend(self.policy.finish());
-            points.push((Scalar::UpdatesPerSec, self.updates as f64 / self.updating.as_secs_f64()));
+            points.push((
+                Scalar::UpdatesPerSec,
+                self.updates as f64 / self.updating.as_secs_f64(),
+            ));
         }
         points
     }

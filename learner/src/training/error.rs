@@ -1,4 +1,4 @@
-//! Why a training ends before its time.
+//! Errors that end a training early.
 
 use std::io;
 use std::path::PathBuf;
@@ -8,20 +8,20 @@ use skein_protocol::snapshot::SnapshotError;
 use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
 use crate::device::DeviceError;
-use crate::evaluation::EvaluationError;
-use crate::flights::reception::ReceptionError;
+use crate::episodes::ReceiverError;
+use crate::evaluation::EvaluationWriteError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;
 use crate::trainer::TrainerRestoreError;
 
-/// Why a training ended before its time.
+/// Reason why a training ended early.
 #[derive(Debug, thiserror::Error)]
-#[allow(missing_docs)] // every variant is the error of the part it is named after
+#[allow(missing_docs)] // every variant is named after the part that failed
 pub enum TrainingError {
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[error(transparent)]
-    Reception(#[from] ReceptionError),
+    EpisodeReceiver(#[from] ReceiverError),
     #[error(transparent)]
     Insert(#[from] InsertError),
     #[error(transparent)]
@@ -33,7 +33,7 @@ pub enum TrainingError {
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
     #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
+    Evaluation(#[from] EvaluationWriteError),
     #[error("cannot start a thread: {0}")]
     Thread(#[source] io::Error),
     #[error("{}: {source}", path.display())]
@@ -42,63 +42,70 @@ pub enum TrainingError {
         #[source]
         source: io::Error,
     },
-    /// A checkpoint is undamaged, and still makes no sense.
-    #[error("the checkpoint of flight {flights} cannot be resumed: {source}")]
+    /// A checkpoint is undamaged, but does not fit.
+    #[error("the checkpoint of episode {episodes} cannot be resumed: {source}")]
     Restore {
-        flights: u64,
+        episodes: u64,
         #[source]
         source: TrainerRestoreError,
     },
-    /// A checkpoint lacks what it should hold.
-    #[error("the checkpoint of flight {flights} cannot be resumed: its snapshot {version} {problem}")]
+    /// A checkpoint lacks a snapshot it should hold, or holds another one.
+    #[error(
+        "the checkpoint of episode {episodes} cannot be resumed: its snapshot {version} {problem}"
+    )]
     RestoredSnapshot {
-        flights: u64,
+        episodes: u64,
         version: u64,
         problem: &'static str,
     },
-    /// There is no checkpoint where there must have been one.
+    /// No checkpoint exists where there must have been one.
     #[error(
-        "{} has {rows} flights, and yet there is no checkpoint in {}, or no such folder; one is written each {first_after} flights: put the checkpoints back; or, to train anew from the first flight, remove flights.csv", flights_csv.display(), checkpoints.display()
+        "{} has {rows} episodes, but {} holds no checkpoint or does not exist; \
+         one is written every {first_after} episodes: put the checkpoints back; \
+         or, to train again from the first episode, remove episodes.csv",
+        episodes_csv.display(),
+        checkpoints.display()
     )]
     CheckpointsLost {
-        flights_csv: PathBuf,
+        episodes_csv: PathBuf,
         rows: u64,
         checkpoints: PathBuf,
         first_after: u64,
     },
-    /// It was told to stop and did not wait for the end of an epoch's updates, or of the flight that it was learning from.
-    #[error("stopped amid an epoch")]
+    /// The run was stopped before the end of an epoch's updates, or of the episode in progress.
+    #[error("stopped in the middle of an epoch")]
     Abandoned,
 }
 
 impl TrainingError {
-    /// Whether a new life of the learner may get further: the transport failed, and nothing that was computed is at fault. Anything else would come again.
-    pub fn is_of_the_transport(&self) -> bool {
-        matches!(self, Self::Reception(ReceptionError::Transport(_)))
+    /// `true` if a new incarnation of the learner may get further: the transport failed, and
+    /// nothing that was computed is at fault. Any other error would recur.
+    pub fn is_transport_failure(&self) -> bool {
+        matches!(self, Self::EpisodeReceiver(ReceiverError::Transport(_)))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::ids::FlightId;
+    use skein_protocol::ids::EpisodeId;
 
     use super::*;
-    use crate::flights::desk::HopelessFlight;
+    use crate::episodes::dispatcher::HopelessEpisode;
 
     #[test]
-    fn only_a_failed_transport_is_worth_another_life() {
-        let hopeless = HopelessFlight {
-            flight: FlightId(3),
+    fn only_a_failed_transport_is_worth_another_incarnation() {
+        let hopeless = HopelessEpisode {
+            episode: EpisodeId(3),
             failures: 3,
             why: "the simulator broke down".to_owned(),
         };
-        let error = |error: ReceptionError| TrainingError::from(error);
-        assert!(error(ReceptionError::Transport("no memory".to_owned())).is_of_the_transport());
-        assert!(!error(hopeless.into()).is_of_the_transport());
+        let error = |error: ReceiverError| TrainingError::from(error);
+        assert!(error(ReceiverError::Transport("no memory".to_owned())).is_transport_failure());
+        assert!(!error(hopeless.into()).is_transport_failure());
         let diverged = UpdateError::NonFinite {
             tensor: "critic loss",
             update: 7,
         };
-        assert!(!TrainingError::from(diverged).is_of_the_transport());
+        assert!(!TrainingError::from(diverged).is_transport_failure());
     }
 }

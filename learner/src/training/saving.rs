@@ -1,4 +1,4 @@
-//! How a run outlives its learner: what goes into a checkpoint, how a learner goes on from one, and how it ends.
+//! Checkpoints of a run: what goes into one, how a learner resumes from one, and how a run ends.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -7,31 +7,35 @@ use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 use std::{fs, io};
 
-use skein_protocol::config::Config;
-use skein_protocol::fault::{FaultPoint, pass};
+use skein_protocol::config::{Config, LearningSection};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::progress::{self, Phase};
-use skein_protocol::run::{Life, RunDirectory, RunIdentity};
+use skein_protocol::progress::{self, LearnerPhase};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{Ending, Summary};
+use skein_protocol::summary::{RunEnding, Summary};
+use skein_run::fault::{FaultPoint, die_if_armed};
+use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
 
-use super::{EpochCurves, StopWatch, Training, TrainingError};
-use crate::checkpoint::{CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, Progress};
+use super::{EpochCurves, StopMonitor, Training, TrainingError};
+use crate::checkpoint::{
+    CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, TrainingProgress,
+};
 use crate::disk::Disk;
-use crate::flights::reception::Reception;
-use crate::lives::begin_life;
+use crate::episodes::receiver::EpisodeReceiver;
+use crate::incarnations::begin_incarnation;
 use crate::metrics::{Metrics, MetricsError};
-use crate::report::{Reporter, tell};
+use crate::notice::notify_user;
+use crate::report::Reporter;
 use crate::threads;
 use crate::trainer::Trainer;
 
 impl<'a> Training<'a> {
-    /// A training at its newest undamaged checkpoint, or at its start if it has none. The flights that were in the air are ordered again.
+    /// Starts a training at its newest undamaged checkpoint, or at episode 0. Orders again what was
+    /// in flight.
     pub(super) fn begin(
         directory: &'a RunDirectory,
         identity: &'a RunIdentity,
-        life: Life,
+        incarnation: LearnerIncarnation,
         config: &'a Config,
         stop: &'a Arc<AtomicBool>,
     ) -> Result<Self, TrainingError> {
@@ -41,35 +45,44 @@ impl<'a> Training<'a> {
         let store = CheckpointStore::new(&directory.checkpoints(), config);
         let fits = |state: &CheckpointState| {
             let metrics = &state.progress.metrics;
-            metrics.check(directory).map_err(|problem| CheckpointError::Unfit {
-                flights: state.progress.flights,
-                problem: problem.to_string(),
-            })
+            metrics
+                .check(directory)
+                .map_err(|problem| CheckpointError::Unfit {
+                    episodes: state.progress.episodes,
+                    problem: problem.to_string(),
+                })
         };
         let newest = store.load_newest(fits, |error| {
-            tell(&format!("a checkpoint is not used: {error}"));
+            notify_user(&format!("a checkpoint is not used: {error}"));
         })?;
         let (saved, snapshots) = match newest {
             Some(checkpoint) => {
-                tell(&format!("going on after flight {}", checkpoint.progress.flights));
+                notify_user(&format!(
+                    "resuming after episode {}",
+                    checkpoint.progress.episodes
+                ));
                 restore(&mut trainer, checkpoint)?
             }
-            // A life that died before its first checkpoint may have left files: they are dropped as if they came after flight 0.
+            // An incarnation killed before its first checkpoint may have left files: they are
+            // dropped, as results after episode 0.
             None => {
                 refuse_lost_checkpoints(directory, config)?;
                 (start(config, &trainer), BTreeMap::new())
             }
         };
-        let reception = Reception::start(identity, life, config)?;
-        // Before anything is written: if that has to wait for room on the disk, it is told.
-        let reporter = Reporter::start(first_line(config, &saved), reception.shared(), disk.clone())
-            .map_err(TrainingError::Thread)?;
-        let lives = directory.lives_csv();
+        let receiver = EpisodeReceiver::start(identity, incarnation, config)?;
+        // Started before anything is written, so that waiting for a full disk is reported.
+        let reporter =
+            Reporter::start(first_report(config, &saved), receiver.state(), disk.clone())
+                .map_err(TrainingError::Thread)?;
+        let incarnations = directory.incarnations_csv();
         let resumes = disk
-            .with_room(&lives, || begin_life(&lives, saved.flights))
-            .map_err(file_error(&lives))?;
-        if resumes > 0 && saved.flights == 0 {
-            tell("there is no checkpoint yet: beginning from the first flight");
+            .with_room(&incarnations, || {
+                begin_incarnation(&incarnations, saved.episodes)
+            })
+            .map_err(file_error(&incarnations))?;
+        if resumes > 0 && saved.episodes == 0 {
+            notify_user("there is no checkpoint yet: starting from the first episode");
         }
         let metrics = resume_metrics(directory, &saved, &disk)?;
         let mut training = Self {
@@ -77,11 +90,11 @@ impl<'a> Training<'a> {
             identity,
             directory,
             stop,
-            stop_watch: StopWatch::of(stop),
+            stop_monitor: StopMonitor::of(stop),
             layout: SnapshotLayout::of(config),
             trainer,
             reporter,
-            reception,
+            receiver,
             metrics,
             checkpoints: CheckpointWriter::start(store, disk.clone())?,
             disk,
@@ -91,33 +104,34 @@ impl<'a> Training<'a> {
             timer,
             progress: saved.clone(),
             saved,
+            saved_snapshots: snapshots.clone(),
             resumes,
-            in_the_air: VecDeque::new(),
-            under_way: None,
+            in_flight: VecDeque::new(),
+            open_episode: None,
             snapshots,
         };
-        training.remove_later_results()?;
-        training.take_up()?;
+        training.reset_results()?;
+        training.restore_orders()?;
         Ok(training)
     }
 
-    /// Publishes what was published and orders what was ordered when the checkpoint was taken.
-    fn take_up(&mut self) -> Result<(), TrainingError> {
-        let orders = std::mem::take(&mut self.progress.in_the_air);
-        if let Some(flights) = (self.progress.epochs > 0).then_some(self.progress.flights) {
+    /// Repeats what was published and ordered when the checkpoint was taken.
+    fn restore_orders(&mut self) -> Result<(), TrainingError> {
+        let orders = std::mem::take(&mut self.progress.in_flight);
+        if let Some(episodes) = (self.progress.epochs > 0).then_some(self.progress.episodes) {
             tracing::info!(
-                flights,
+                episodes,
                 epochs = self.progress.epochs,
                 resumes = self.resumes,
                 "resumed from a checkpoint"
             );
         }
-        // The present one comes last, so that it is the newest for whoever attaches now.
+        // The present snapshot comes last, so that it is the newest for actors that attach now.
         for order in &orders {
             let version = PolicyVersion(order.policy_version);
             if version < self.progress.version() {
                 let snapshot = self.kept_snapshot(version)?;
-                self.reception.publish(snapshot)?;
+                self.receiver.publish(snapshot)?;
             }
         }
         for order in orders {
@@ -126,8 +140,9 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Takes back what an earlier life has written since the checkpoint: it was of a future that is to be flown again.
-    fn remove_later_results(&mut self) -> Result<(), TrainingError> {
+    /// Resets the result files to the checkpoint that the progress is that of: what was written
+    /// after it will be computed again.
+    fn reset_results(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress
             .best
@@ -138,6 +153,9 @@ impl<'a> Training<'a> {
             (best, self.directory.best_snapshot()),
             (latest, self.directory.latest_snapshot()),
             (None, self.directory.summary_json()),
+            (None, self.directory.evaluation_json()),
+            (None, self.directory.evaluation_trajectories_csv()),
+            (None, self.directory.reconstructions()),
         ] {
             match version {
                 Some(version) => self.save_snapshot(version, &path)?,
@@ -147,35 +165,40 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    /// A snapshot that is kept.
+    /// Returns a snapshot of this run that is still needed.
     pub(super) fn kept_snapshot(&self, version: PolicyVersion) -> Result<Snapshot, TrainingError> {
         let missing = || TrainingError::RestoredSnapshot {
-            flights: self.saved.flights,
+            episodes: self.saved.episodes,
             version: version.0,
             problem: "is missing",
         };
         self.snapshots.get(&version).cloned().ok_or_else(missing)
     }
 
-    /// Writes a snapshot that is kept to a file.
-    pub(super) fn save_snapshot(&self, version: PolicyVersion, path: &Path) -> Result<(), TrainingError> {
+    /// Writes such a snapshot to a file.
+    pub(super) fn save_snapshot(
+        &self,
+        version: PolicyVersion,
+        path: &Path,
+    ) -> Result<(), TrainingError> {
         let snapshot = self.kept_snapshot(version)?;
-        Ok(self
-            .disk
-            .with_room(path, || snapshot.save(path, &self.layout, self.config))?)
+        Ok(self.disk.with_room(path, || {
+            save_snapshot(&snapshot, path, &self.layout, self.config)
+        })?)
     }
 
     pub(super) fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
-        if self.progress.flights - self.saved.flights >= self.config.checkpoints.every_flights {
+        if self.progress.episodes - self.saved.episodes >= self.config.checkpoints.every_episodes {
             self.checkpoint()?;
         }
         Ok(())
     }
 
-    /// Hands the state to the writing thread, unless it is that of the newest checkpoint; and keeps the newest snapshot as a file.
+    /// Hands the state to the writing thread, unless the newest checkpoint already has it. Also
+    /// saves the newest snapshot as a file.
     ///
-    /// Only between epochs, and so between flights: then the state follows from the epochs done, whether a candidate was looked at, and what had been ordered
-    /// earlier. What lies in the middle of a flight is in none.
+    /// Called only between epochs, hence between episodes. There the state follows from the epochs
+    /// done, the last candidate, and the orders in flight; no checkpoint holds half an episode.
     pub(super) fn checkpoint(&mut self) -> Result<(), TrainingError> {
         let (now, saved) = (&self.progress, &self.saved);
         if (now.epochs, now.latest_candidate) == (saved.epochs, saved.latest_candidate) {
@@ -185,66 +208,81 @@ impl<'a> Training<'a> {
         self.metrics.flush()?;
         self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
         self.timer.lap(Stage::Checkpoint, 0);
-        let progress = self.counted();
+        let progress = self.full_progress();
+        let snapshots = self.snapshots.clone();
         let state = CheckpointState {
             progress: progress.clone(),
             tensors: self.trainer.tensors(),
             replay: self.trainer.replay().state(),
-            snapshots: self.snapshots.values().cloned().collect(),
+            snapshots: snapshots.values().cloned().collect(),
         };
         self.checkpoints.save(state, self.metrics.files())?;
-        self.saved = progress;
+        (self.saved, self.saved_snapshots) = (progress, snapshots);
         self.timer.lap(Stage::Checkpoint, 1);
         Ok(())
     }
 
-    /// The progress with everything that others count.
-    fn counted(&self) -> Progress {
+    /// Returns the progress, with the counters that other parts keep.
+    fn full_progress(&self) -> TrainingProgress {
         let newest = self.snapshots.get(&self.progress.version());
-        Progress {
+        let receiver = self.receiver.state();
+        TrainingProgress {
             policy_sha256: newest.map(Snapshot::sha256).unwrap_or_default(),
             environment_steps: self.trainer.steps(),
             vae_steps: self.trainer.vae_updates(),
             policy_updates: self.trainer.updates(),
-            in_the_air: self.in_the_air.iter().map(|epoch| epoch.order).collect(),
+            in_flight: self.in_flight.iter().map(|epoch| epoch.order).collect(),
             metrics: self.metrics.state(),
-            spent: self
-                .progress
-                .spent
-                .with_this_life(self.started, self.timer.times(), &self.reception.shared()),
+            spent: self.progress.spent.with_this_incarnation(
+                self.started,
+                self.timer.times(),
+                &receiver.times(),
+                &receiver.faults(),
+            ),
             ..self.progress.clone()
         }
     }
 
-    /// Has everything saved; returns how far the run is.
-    pub(super) fn save(&mut self) -> Result<Progress, TrainingError> {
-        self.reporter.update(|progress| progress.phase = Phase::Finishing);
+    /// Saves everything; returns the progress.
+    pub(super) fn save(&mut self) -> Result<TrainingProgress, TrainingError> {
+        self.reporter
+            .update(|progress| progress.phase = LearnerPhase::Finishing);
         self.metrics.flush()?;
         self.checkpoint()?;
         self.timer.lap(Stage::OtherTraining, 0);
-        Ok(self.counted())
+        Ok(self.full_progress())
     }
 
-    /// Gives up an epoch half done: the files tell what the next life will go on from. Returns how far that is.
-    pub(super) fn go_back(&mut self) -> Result<Progress, TrainingError> {
+    /// Gives up an epoch half done: resets the files to the newest checkpoint, from which the next
+    /// incarnation resumes. Returns that checkpoint's progress.
+    pub(super) fn roll_back(&mut self) -> Result<TrainingProgress, TrainingError> {
         tracing::warn!(
-            flights = self.progress.flights,
-            checkpoint = self.saved.flights,
-            "told to stop, and the end of the epoch takes too long: back to the newest checkpoint"
+            episodes = self.progress.episodes,
+            checkpoint = self.saved.episodes,
+            "stopped, and the end of the epoch takes too long: back to the newest checkpoint"
         );
-        self.reporter.update(|progress| progress.phase = Phase::Finishing);
-        // What is flushed now cannot follow what is cut.
+        self.reporter
+            .update(|progress| progress.phase = LearnerPhase::Finishing);
+        // Flush before the files are cut, so that nothing follows later.
         self.metrics.flush()?;
         self.metrics = resume_metrics(self.directory, &self.saved, &self.disk)?;
         self.metrics.flush()?;
+        // A better snapshot may have been found since.
+        self.progress = self.saved.clone();
+        self.snapshots = self.saved_snapshots.clone();
+        self.reset_results()?;
         Ok(self.saved.clone())
     }
 
-    /// Finishes the checkpoint being written, sums up how the run ended and how far it came, and lets the actors go.
+    /// Finishes the checkpoint being written, writes the summary, and releases the actors.
     ///
-    /// In this order: a learner that dies before all is written is started again, and needs its actors still.
-    pub(super) fn conclude(self, end: Result<(Ending, Progress), TrainingError>) -> Result<Summary, TrainingError> {
-        // A thread that has ended can no longer be asked.
+    /// The order matters: a learner killed before everything is written is started again, and still
+    /// needs its actors.
+    pub(super) fn conclude(
+        self,
+        end: Result<(RunEnding, TrainingProgress), TrainingError>,
+    ) -> Result<Summary, TrainingError> {
+        // The times of a thread are gone once it has ended.
         let thread_cpu_secs = threads::cpu_secs();
         let written = self.checkpoints.finish();
         let summed_up = match (end, written) {
@@ -262,40 +300,52 @@ impl<'a> Training<'a> {
                 Err(error)
             }
         };
-        self.reception.finish();
+        self.receiver.finish();
         summed_up
     }
 }
 
-fn save_summary(directory: &RunDirectory, disk: &Disk, summary: &Summary) -> Result<(), TrainingError> {
-    pass(FaultPoint::LearnerBeforeSummary);
+fn save_summary(
+    directory: &RunDirectory,
+    disk: &Disk,
+    summary: &Summary,
+) -> Result<(), TrainingError> {
+    die_if_armed(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
-    disk.with_room(&path, || summary.save(&path)).map_err(file_error(&path))
+    disk.with_room(&path, || directory.save_summary(summary))
+        .map_err(file_error(&path))
 }
 
-/// The metrics as they were when `saved` was.
-fn resume_metrics(directory: &RunDirectory, saved: &Progress, disk: &Disk) -> Result<Metrics, MetricsError> {
+/// Reopens the metrics at the position of `saved`.
+fn resume_metrics(
+    directory: &RunDirectory,
+    saved: &TrainingProgress,
+    disk: &Disk,
+) -> Result<Metrics, MetricsError> {
     disk.with_room(directory.root(), || {
         Metrics::resume(directory, saved.metrics.clone(), disk)
     })
 }
 
-/// A run without checkpoints is not begun anew without a word when it has had some: their folder is gone, or `flights.csv` shows more flights than can be
-/// flown before the first. What was flown before any is flown again.
+/// Refuses to start from episode 0 a run that has had checkpoints. Their folder is gone, or
+/// `episodes.csv` has more episodes than can be flown before the first checkpoint. Episodes flown
+/// before any checkpoint are simply flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
-    let flights_csv = directory.flights_csv();
-    let content = match fs::read(&flights_csv) {
+    let episodes_csv = directory.episodes_csv();
+    let content = match fs::read(&episodes_csv) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-        content => content.map_err(file_error(&flights_csv))?,
+        content => content.map_err(file_error(&episodes_csv))?,
     };
     let lines = content.iter().filter(|&&byte| byte == b'\n').count() as u64;
     let rows = lines.saturating_sub(1);
-    let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_flights);
-    // A checkpoint is taken at the end of an epoch, and training goes on while it is written: until the next one is to be handed over. Their folder was
-    // made with the run's.
-    if rows > 2 * (first_after + config.learning.flights_per_epoch) || rows > 0 && !checkpoints.is_dir() {
+    let (checkpoints, first_after) = (directory.checkpoints(), config.checkpoints.every_episodes);
+    // A checkpoint is taken at the end of an epoch, and training continues while it is written,
+    // until the next one is due. The folder was created with the run's.
+    if rows > 2 * (first_after + config.learning.episodes_per_epoch)
+        || rows > 0 && !checkpoints.is_dir()
+    {
         return Err(TrainingError::CheckpointsLost {
-            flights_csv,
+            episodes_csv,
             rows,
             checkpoints,
             first_after,
@@ -304,34 +354,35 @@ fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<
     Ok(())
 }
 
-/// A run that has not begun.
-fn start(config: &Config, trainer: &Trainer) -> Progress {
-    Progress {
+/// Progress of a run that has not begun.
+fn start(config: &Config, trainer: &Trainer) -> TrainingProgress {
+    TrainingProgress {
         policy_sha256: trainer.snapshot(PolicyVersion(0)).sha256(),
-        ..Progress::start(config.evaluation.window_flights as usize)
+        ..TrainingProgress::start(config.evaluation.window_episodes as usize)
     }
 }
 
-/// Takes a checkpoint's state over into `trainer`; what remains of it is returned.
+/// Restores a checkpoint into `trainer`; returns the rest of the checkpoint.
 fn restore(
     trainer: &mut Trainer,
     checkpoint: CheckpointState,
-) -> Result<(Progress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
+) -> Result<(TrainingProgress, BTreeMap<PolicyVersion, Snapshot>), TrainingError> {
     let CheckpointState {
         progress,
         tensors,
         replay,
         snapshots,
     } = checkpoint;
-    let flights = progress.flights;
+    let episodes = progress.episodes;
     trainer
         .restore(&progress, &tensors, replay)
-        .map_err(|source| TrainingError::Restore { flights, source })?;
+        .map_err(|source| TrainingError::Restore { episodes, source })?;
     let version = progress.version();
-    // The parameters are there twice, in the tensors and in the snapshot: a restored trainer that would publish another snapshot is not the one stored.
+    // The parameters are stored twice, in the tensors and in the snapshot. A trainer that would
+    // publish another snapshot was not restored correctly.
     if trainer.snapshot(version).sha256() != progress.policy_sha256 {
         return Err(TrainingError::RestoredSnapshot {
-            flights,
+            episodes,
             version: version.0,
             problem: "is not that of its tensors",
         });
@@ -343,22 +394,28 @@ fn restore(
     Ok((progress, snapshots))
 }
 
-/// What is reported before anything has happened in this life.
-fn first_line(config: &Config, saved: &Progress) -> progress::Progress {
+/// First report of this incarnation.
+fn first_report(config: &Config, saved: &TrainingProgress) -> progress::ProgressReport {
     let windows = &saved.metrics.windows;
-    progress::Progress {
-        flights: saved.flights,
+    progress::ProgressReport {
+        episodes: saved.episodes,
         steps: saved.environment_steps,
         updates: saved.policy_updates,
         vae_updates: saved.vae_steps,
         walls_passed: windows.walls_passed.mean(),
         mean_return: windows.total_reward.mean(),
         elapsed_secs: saved.spent.wall_secs,
-        ..progress::Progress::start(config.run.flights)
+        ..progress::ProgressReport::start(config.run.episodes)
     }
 }
 
-fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &Progress, resumes: u64) -> Summary {
+fn summary(
+    identity: &RunIdentity,
+    config: &Config,
+    ending: RunEnding,
+    progress: &TrainingProgress,
+    resumes: u64,
+) -> Summary {
     let best = progress.best.as_ref();
     Summary {
         skein_version: env!("SKEIN_VERSION").to_owned(),
@@ -370,11 +427,16 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
         best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
         trained: progress.trained,
-        flights: progress.flights,
+        untrained: untrained(
+            &config.learning,
+            progress.environment_steps,
+            progress.policy_updates,
+        ),
+        episodes: progress.episodes,
         steps: progress.environment_steps,
         updates: progress.policy_updates,
         vae_updates: progress.vae_steps,
-        evaluation_flights: progress.evaluation_flights,
+        evaluation_episodes: progress.evaluation_episodes,
         tickets_reissued: progress.spent.tickets_reissued.values().sum(),
         records_refused: progress.spent.records_refused.values().sum(),
         reissued_by_reason: progress.spent.tickets_reissued.clone(),
@@ -384,6 +446,27 @@ fn summary(identity: &RunIdentity, config: &Config, ending: Ending, progress: &P
         stages: progress.spent.stages,
         thread_cpu_secs: BTreeMap::new(),
     }
+}
+
+/// Returns the reason why a policy is untrained after `steps`, and the remedy, if there was no
+/// update.
+fn untrained(learning: &LearningSection, steps: u64, updates: u64) -> Option<String> {
+    let (warmup, per_step) = (learning.warmup_steps, learning.updates_per_step);
+    let reason = if updates > 0 {
+        return None;
+    } else if per_step == 0.0 {
+        "learning.updates_per_step = 0 allows none; raise it".to_owned()
+    } else if steps <= warmup as u64 {
+        format!(
+            "the warm-up of learning.warmup_steps = {warmup} was not over after {steps} steps; \
+            raise run.episodes, or lower learning.warmup_steps"
+        )
+    } else {
+        "the run ended before the first one was due; raise run.episodes".to_owned()
+    };
+    Some(format!(
+        "The policy is untrained, because there was no update: {reason}."
+    ))
 }
 
 fn remove(path: &Path) -> io::Result<()> {
@@ -403,17 +486,44 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_that_lost_its_checkpoints_is_not_begun_anew_without_a_word() {
+    fn an_untrained_policy_is_called_so_with_the_reason_and_the_remedy() {
+        let mut learning = Config::default().learning;
+        learning.warmup_steps = 800;
+        assert_eq!(untrained(&learning, 900, 1), None);
+        let says = |learning: &LearningSection, steps, part: &str| {
+            let reason = untrained(learning, steps, 0).unwrap();
+            assert!(
+                reason.starts_with("The policy is untrained") && reason.contains(part),
+                "{reason}"
+            );
+        };
+        says(
+            &learning,
+            305,
+            "learning.warmup_steps = 800 was not over after 305 steps",
+        );
+        says(&learning, 801, "raise run.episodes");
+        learning.updates_per_step = 0.0;
+        says(&learning, 9000, "learning.updates_per_step = 0");
+    }
+
+    #[test]
+    fn a_run_that_lost_its_checkpoints_is_not_silently_started_again() {
         let folder = tempfile::tempdir().unwrap();
         let directory = RunDirectory::new(folder.path());
         fs::create_dir(directory.checkpoints()).unwrap();
         let mut config = Config::default();
-        config.checkpoints.every_flights = 20;
-        config.learning.flights_per_epoch = 5;
+        config.checkpoints.every_episodes = 20;
+        config.learning.episodes_per_epoch = 5;
         refuse_lost_checkpoints(&directory, &config).unwrap();
-        let flown =
-            |flights| fs::write(directory.flights_csv(), format!("header\n{}", "row\n".repeat(flights))).unwrap();
-        // The second checkpoint waits until the first is in place, so that many can be flown without one.
+        let flown = |episodes| {
+            fs::write(
+                directory.episodes_csv(),
+                format!("header\n{}", "row\n".repeat(episodes)),
+            )
+            .unwrap()
+        };
+        // The second checkpoint waits for the first, so many episodes can be flown without one.
         flown(50);
         refuse_lost_checkpoints(&directory, &config).unwrap();
         fs::remove_dir(directory.checkpoints()).unwrap();
@@ -421,7 +531,7 @@ mod tests {
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "their folder is gone"
         );
-        std::os::unix::fs::symlink("/no/such/disk", directory.checkpoints()).unwrap();
+        std::os::unix::fs::symlink(folder.path().join("missing"), directory.checkpoints()).unwrap();
         assert!(
             refuse_lost_checkpoints(&directory, &config).is_err(),
             "it leads nowhere"
@@ -429,8 +539,14 @@ mod tests {
         fs::remove_file(directory.checkpoints()).unwrap();
         fs::create_dir(directory.checkpoints()).unwrap();
         flown(51);
-        let error = refuse_lost_checkpoints(&directory, &config).unwrap_err().to_string();
-        for part in ["flights.csv has 51 flights", "checkpoints", "remove flights.csv"] {
+        let error = refuse_lost_checkpoints(&directory, &config)
+            .unwrap_err()
+            .to_string();
+        for part in [
+            "episodes.csv has 51 episodes",
+            "checkpoints",
+            "remove episodes.csv",
+        ] {
             assert!(error.contains(part), "`{error}` does not mention `{part}`");
         }
     }

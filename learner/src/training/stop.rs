@@ -1,24 +1,25 @@
-//! How long a learner that was told to stop still goes on.
+//! Time limit for a learner that was asked to stop.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use super::TrainingError;
-use crate::flights::reception::Shared;
+use crate::episodes::ReceiverState;
 
-/// Time for the rest of an epoch's updates once the run is told to stop, and of a flight in legs that is learned from already. Longer than those of any configuration here take, so that everything learned is
-/// saved as a rule; and shorter than the 90 seconds after which the supervisor ends a learner that does not.
+/// Time for the rest of an epoch's updates after a stop, and for the rest of an episode in
+/// segments. It exceeds what any shipped configuration takes, so everything learned is usually
+/// saved. It is shorter than the 90 seconds after which the supervisor kills the learner.
 const GRACE: Duration = Duration::from_secs(60);
 
-/// Looks at the stop between updates.
-pub(super) struct StopWatch<'a> {
+/// Checks the stop flag between updates.
+pub(super) struct StopMonitor<'a> {
     stop: &'a AtomicBool,
     grace: Duration,
-    /// When it was first seen.
+    /// Time at which the flag was first seen set.
     seen: Option<Instant>,
 }
 
-impl<'a> StopWatch<'a> {
+impl<'a> StopMonitor<'a> {
     pub(super) fn of(stop: &'a AtomicBool) -> Self {
         Self {
             stop,
@@ -27,20 +28,23 @@ impl<'a> StopWatch<'a> {
         }
     }
 
-    /// To be asked while the next leg of a flight is waited for: the flight is flown to its end, so that what was learned from it can be saved.
+    /// Called while waiting for the next segment of an episode. The episode is flown to its end, so
+    /// that what was learned from it can be saved.
     ///
     /// # Errors
-    /// [`TrainingError::Abandoned`] when that takes too long, or nobody is there to fly it.
-    pub(super) fn amid_flight(&mut self, reception: &Shared) -> Result<(), TrainingError> {
-        if self.stop.load(Ordering::Relaxed) && reception.live_actors().is_empty() {
+    /// [`TrainingError::Abandoned`] when that takes too long, or no actor is there to fly it.
+    pub(super) fn during_episode(&mut self, receiver: &ReceiverState) -> Result<(), TrainingError> {
+        if self.stop.load(Ordering::Relaxed) && receiver.live_actors().is_empty() {
             return Err(TrainingError::Abandoned);
         }
         self.after_update()
     }
 
+    /// Called after each update.
+    ///
     /// # Errors
-    /// [`TrainingError::Abandoned`] when the epoch's updates have taken too long since the stop: they are given up half done, and nothing of them is
-    /// kept. The run goes on from the checkpoint before, and will do the same updates.
+    /// [`TrainingError::Abandoned`] when the epoch's updates have taken too long since the stop.
+    /// None of them is kept: the run resumes from the checkpoint before, and repeats them.
     pub(super) fn after_update(&mut self) -> Result<(), TrainingError> {
         if !self.stop.load(Ordering::Relaxed) {
             return Ok(());
@@ -59,17 +63,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn updates_go_on_after_the_stop_but_not_for_long() {
+    fn updates_continue_after_the_stop_but_not_for_long() {
         let stop = AtomicBool::new(false);
-        let mut watch = StopWatch {
+        let mut watch = StopMonitor {
             grace: Duration::from_millis(20),
-            ..StopWatch::of(&stop)
+            ..StopMonitor::of(&stop)
         };
         std::thread::sleep(Duration::from_millis(30));
         watch.after_update().unwrap();
         stop.store(true, Ordering::Relaxed);
         watch.after_update().unwrap();
         std::thread::sleep(Duration::from_millis(30));
-        assert!(matches!(watch.after_update(), Err(TrainingError::Abandoned)));
+        assert!(matches!(
+            watch.after_update(),
+            Err(TrainingError::Abandoned)
+        ));
     }
 }

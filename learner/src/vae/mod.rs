@@ -1,8 +1,11 @@
-//! The variational auto-encoder: gives the policy its eyes.
+//! The variational auto-encoder (VAE): compresses depth images for the policy.
 //!
-//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean. Two engines compute it, which begin with the same parameters and are held to each other by tests; with a U-Net for a decoder
-//! (`Decoder` in `networks/decoder.rs` says what is to be expected of one) it is on libtorch in any case.
+//! During the first steps of a run, it learns to reproduce depth images through a short latent
+//! code; then it is frozen (the paper, section 3.3). The policy sees the code's mean.
+//!
+//! Two engines compute the same step: [`NativeVae`] on Skein's own kernels, [`TorchVae`] on
+//! libtorch. They start from the same parameters, and tests compare them. With a U-Net as decoder
+//! (see `Decoder` in `networks/decoder.rs`), libtorch is always used.
 
 mod native;
 mod torch;
@@ -12,34 +15,40 @@ use tch::{Device, Tensor};
 
 use crate::error::UpdateError;
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-pub use native::{LAYERS, NativeVae, Pass, Spent};
+pub use native::{LAYERS, LayerTimes, NativeVae, Pass};
 pub use torch::{TorchVae, images_from_bytes};
 
 /// Encoder, decoder and their optimizer, computed by the configured engine.
 #[derive(Debug)]
-#[expect(clippy::large_enum_variant, reason = "there is one of them in a process")]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one of them in a process"
+)]
 pub enum Vae {
-    /// Kernels of our own, on the processor.
+    /// Skein's own kernels, on the CPU.
     Native(NativeVae),
     /// libtorch, on any device.
     Libtorch(TorchVae),
 }
 
-/// What one VAE step reports.
+/// Metrics of one VAE step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VaeMetrics {
-    /// What was minimised: squared error summed over an image's pixels plus weighted divergence, mean over the batch.
+    /// Minimised loss: the squared error summed over an image's pixels, plus the weighted
+    /// divergence; mean over the batch.
     pub loss: f32,
-    /// Mean squared error of a pixel, depth in [0, 1].
+    /// Mean squared error per pixel, depth in [0, 1].
     pub pixel_error: f32,
-    /// Kullback-Leibler divergence of the code's distribution from the standard normal, in nats, mean over the batch: how much the code tells.
+    /// Kullback-Leibler divergence of the latent code's distribution from the standard normal, in
+    /// nats, mean over the batch. It measures how much information the code carries.
     pub divergence: f32,
 }
 
 impl Vae {
-    /// An untrained VAE whose parameters depend on the run's seed alone. `device` is libtorch's; the native engine has the processor.
+    /// Returns an untrained VAE; its parameters depend on the run's seed alone. `device` is
+    /// libtorch's; the native engine always runs on the CPU.
     pub fn new(section: &VaeSection, run: &RunSection, device: Device) -> Self {
         match section.engine(run) {
             Engine::Native => Self::Native(NativeVae::new(section, run.seed, run.learner_threads)),
@@ -47,10 +56,11 @@ impl Vae {
         }
     }
 
-    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
+    /// Makes one step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names the value that was not finite and the step's number;
+    /// nothing has changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         match self {
             Self::Native(vae) => vae.update(images, noise),
@@ -58,7 +68,8 @@ impl Vae {
         }
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    /// Reconstructs each image from its code's mean: `[n, 72, 128]` u8 to `[n, 72, 128]`, depth in
+    /// [0, 1].
     pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
         match self {
             Self::Native(vae) => vae.reconstruct(images),
@@ -78,7 +89,8 @@ impl Vae {
         }
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`Vae::published_len`] long.
@@ -89,7 +101,7 @@ impl Vae {
         }
     }
 
-    /// VAE steps done so far.
+    /// Number of VAE steps done so far.
     pub fn updates(&self) -> u64 {
         match self {
             Self::Native(vae) => vae.updates(),
@@ -99,7 +111,7 @@ impl Vae {
 }
 
 impl Stateful for Vae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         match self {
             Self::Native(vae) => vae.parts(),
             Self::Libtorch(vae) => vae.parts(),
@@ -108,7 +120,10 @@ impl Stateful for Vae {
 }
 
 fn copy(tensor: &Tensor, into: &mut [f32]) {
-    tensor.to_device(Device::Cpu).contiguous().copy_data(into, into.len());
+    tensor
+        .to_device(Device::Cpu)
+        .contiguous()
+        .copy_data(into, into.len());
 }
 
 #[cfg(test)]

@@ -1,8 +1,10 @@
-//! The engine of our own: forward, backward and Adam over [`skein_kernels`].
+//! The native engine: forward, backward and Adam on [`skein_kernels`].
 //!
-//! Images lie channels-last from the first byte to the last gradient, so that what a kernel sees are runs of memory, read where they lie. The gradients are written
-//! out by hand, layer by layer; what autograd computes is what they are tested against. All results are the same bits for any number of threads and on every
-//! processor.
+//! One step computes the loss of arXiv:1312.6114 with a squared reconstruction error, and its
+//! gradient, in the order of `step.rs`. Images are stored channels-last throughout, so that kernels
+//! read contiguous runs of memory in place. Gradients are written out by hand, layer by layer, and
+//! tested against autograd. All results are the same bits with every instruction set and for any
+//! number of threads; equality across types of processor is not promised (docs/reliability.md).
 
 mod batch;
 mod buffer;
@@ -21,42 +23,42 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{DecoderName, VaeSection};
 use skein_protocol::seeds::{Purpose, derive};
 
-use self::batch::Batch;
+use self::batch::BatchBuffers;
 use self::buffer::Buffer;
 use self::elementwise::{sigmoids, squares};
-use self::members::{Member, by_image, share};
-use self::network::Network;
-use self::order::Order;
-use self::step::{Objective, Step};
-use self::stopwatch::Pass as LayerPass;
+use self::members::{MemberScratch, by_image, share};
+use self::network::VaeNetwork;
+use self::order::ParameterOrder;
+use self::step::{LossParts, StepContext};
 use super::VaeMetrics;
 use crate::error::UpdateError;
 use crate::networks::{Decoder, Encoder, Layout};
 use crate::noise::Noise;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-pub use stopwatch::{LAYERS, Pass, Spent};
+pub use stopwatch::{LAYERS, LayerTimes, Pass};
 
-/// Images reconstructed at once: bounds memory, and the weights are read once for all of them.
+/// Images reconstructed at once: bounds memory, and reads the weights once for all of them.
 const CHUNK: usize = 32;
 
-/// Encoder, decoder and Adam's state, in the order of [`Order`].
+/// Encoder, decoder and Adam's state, arranged by [`ParameterOrder`].
 #[derive(Debug)]
 pub struct NativeVae {
     isa: Isa,
     team: Team,
-    members: Vec<Member>,
-    order: Order,
-    /// Length of the part of PyTorch's order that actors need.
+    members: Vec<MemberScratch>,
+    order: ParameterOrder,
+    /// Length of the prefix of PyTorch's order that actors need.
     published_len: usize,
-    network: Network,
-    /// Whether `network` has packed these parameters.
+    network: VaeNetwork,
+    /// `true` if `network` has packed the present parameters.
     packed: bool,
     parameters: Buffer,
     moments: [Buffer; 2],
-    /// All but that of the weights of the decoder's first convolution, which exists in blocks only.
+    /// Gradient, except for the weights of the decoder's first convolution, which exists only block
+    /// by block.
     gradient: Buffer,
-    batch: Batch,
+    batch: BatchBuffers,
     noise: Vec<f32>,
     steps: u64,
     learning_rate: f64,
@@ -64,7 +66,8 @@ pub struct NativeVae {
 }
 
 impl NativeVae {
-    /// An untrained VAE whose parameters depend on the run's seed alone; the same as [`super::TorchVae`]'s.
+    /// Returns an untrained VAE; its parameters depend on the run's seed alone and equal
+    /// [`super::TorchVae`]'s.
     pub fn new(section: &VaeSection, run_seed: u64, threads: usize) -> Self {
         Self::with_isa(section, run_seed, threads, Isa::best())
     }
@@ -73,21 +76,21 @@ impl NativeVae {
         let mut layout = Layout::default();
         let published_len = Encoder::describe(&mut layout, section.latent).published_len();
         let _ = Decoder::describe(&mut layout, section.latent, DecoderName::Plain);
-        let order = Order::of(&layout);
+        let order = ParameterOrder::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
         let len = initial.len();
         let team = Team::new(threads);
         let mut vae = Self {
             isa,
-            members: (0..team.size()).map(|_| Member::new(isa)).collect(),
+            members: (0..team.size()).map(|_| MemberScratch::new(isa)).collect(),
             team,
             published_len,
-            network: Network::new(isa, section.latent, &order),
+            network: VaeNetwork::new(isa, section.latent, &order),
             packed: false,
             parameters: Buffer::zeroed(len),
             moments: [len, len].map(Buffer::zeroed),
             gradient: Buffer::zeroed(len),
-            batch: Batch::default(),
+            batch: BatchBuffers::default(),
             noise: Vec::new(),
             steps: 0,
             learning_rate: section.learning_rate,
@@ -99,10 +102,11 @@ impl NativeVae {
         vae
     }
 
-    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]`.
+    /// Makes one step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
+    /// [`UpdateError::NonFinite`] names the value that was not finite and the step's number;
+    /// nothing has changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
         self.noise.resize(count * self.network.latent(), 0.0);
@@ -118,10 +122,10 @@ impl NativeVae {
         })
     }
 
-    /// Loss and gradient for these images and `self.noise`.
-    fn objective(&mut self, images: &[u8]) -> Objective {
+    /// Computes loss and gradient for these images and `self.noise`.
+    fn objective(&mut self, images: &[u8]) -> LossParts {
         self.pack();
-        let mut step = Step {
+        let mut step = StepContext {
             isa: self.isa,
             team: &mut self.team,
             members: &mut self.members,
@@ -133,15 +137,18 @@ impl NativeVae {
         step.objective(images, &self.noise, &mut self.gradient)
     }
 
-    /// Whether all that a step would use is finite. A gradient counts as not finite when its squared norm, or for the decoder's first convolution a bound of it,
-    /// overflows.
-    fn check(&mut self, objective: &Objective) -> Result<(), UpdateError> {
+    /// Checks that everything a step would use is finite. For the gradient, its squared norm must
+    /// not overflow; for the decoder's first convolution, a bound of it.
+    fn check(&mut self, objective: &LossParts) -> Result<(), UpdateError> {
         let watch = &mut self.members[0].watch;
         watch.start();
         let blocks = self.network.unfold.place.weight.clone();
         let norm = squares(self.isa, &self.gradient[..blocks.start])
             + squares(self.isa, &self.gradient[blocks.end..])
-            + self.network.unfold.gradient_bound(self.isa, &self.batch.unfolded);
+            + self
+                .network
+                .unfold
+                .gradient_bound(self.isa, &self.batch.unfolded);
         watch.rest();
         for (tensor, value) in [
             ("vae loss", objective.loss),
@@ -157,23 +164,31 @@ impl NativeVae {
         Ok(())
     }
 
-    /// Adam, and what the next step needs of the weights.
+    /// Applies Adam, and packs the weights for the next step.
     fn step(&mut self) {
         self.steps += 1;
         let (isa, learning_rate, number) = (self.isa, self.learning_rate, self.steps);
-        let adam = AdamStep { learning_rate, number };
+        let adam = AdamStep {
+            learning_rate,
+            number,
+        };
         let [first, second] = &mut self.moments;
         let input = &*self.batch.unfolded;
         let mut blocks = self
             .network
             .unfold
             .blocks(&mut self.parameters, [&mut *first, &mut *second]);
-        share(&mut self.team, &mut self.members, &mut blocks, |_, block, member| {
-            let _ = block.gradient(isa, input, &mut member.unfold);
-            member.watch.layer(network::UNFOLD, LayerPass::Gradient);
-            block.step(isa, adam, &mut member.unfold);
-            member.watch.adam_and_packing();
-        });
+        share(
+            &mut self.team,
+            &mut self.members,
+            &mut blocks,
+            |_, block, member| {
+                let _ = block.gradient(isa, input, &mut member.unfold);
+                member.watch.layer(network::UNFOLD, Pass::Gradient);
+                block.step(isa, adam, &mut member.unfold);
+                member.watch.adam_and_packing();
+            },
+        );
         drop(blocks);
         let watch = &mut self.members[0].watch;
         watch.start();
@@ -187,7 +202,7 @@ impl NativeVae {
         watch.adam_and_packing();
     }
 
-    /// Packs the weights if they changed otherwise than by a step.
+    /// Packs the weights if they changed other than by a step.
     fn pack(&mut self) {
         if !self.packed {
             self.network.pack(&mut self.team, &self.parameters);
@@ -196,51 +211,72 @@ impl NativeVae {
         }
     }
 
-    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]`, any number of them.
+    /// Returns the latent mean of each image, `[n, latent]`. `images`: `[n, 72, 128]`, any number
+    /// of them.
     pub fn encode(&mut self, images: &[u8]) -> Vec<f32> {
         self.pack();
         let (network, parameters) = (&self.network, &*self.parameters);
         let mut codes = vec![0.0; images.len() / IMAGE_PIXELS * network.latent()];
         let mut parts: Vec<_> = codes.chunks_exact_mut(network.latent()).collect();
-        share(&mut self.team, &mut self.members, &mut parts, |index, code, member| {
-            let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            for (image, len) in member.images.iter_mut().zip(network.seen_lens()) {
-                image.resize(len);
-            }
-            let images = member.images.each_mut().map(|image| &mut **image);
-            network.see(parameters, depth, images, &mut member.watch);
-            network.mean(parameters, &member.images[4], code);
-        });
+        share(
+            &mut self.team,
+            &mut self.members,
+            &mut parts,
+            |index, code, member| {
+                let depth = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                for (image, len) in member.images.iter_mut().zip(network.encoder_lens()) {
+                    image.resize(len);
+                }
+                let images = member.images.each_mut().map(|image| &mut **image);
+                network.encoder_forward(parameters, depth, images, &mut member.watch);
+                network.mean(parameters, &member.images[4], code);
+            },
+        );
         codes
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]`.
+    /// Reconstructs each image from its code's mean: `[n, 72, 128]` u8 to `[n, 72, 128]`, depth in
+    /// [0, 1].
     pub fn reconstruct(&mut self, images: &[u8]) -> Vec<f32> {
         let mut seen = Vec::with_capacity(images.len());
         for images in images.chunks(CHUNK * IMAGE_PIXELS) {
             let codes = self.encode(images);
             let (isa, count) = (self.isa, images.len() / IMAGE_PIXELS);
-            let (network, parameters, batch) = (&mut self.network, &*self.parameters, &mut self.batch);
+            let (network, parameters, batch) =
+                (&mut self.network, &*self.parameters, &mut self.batch);
             batch.resize(network, count);
             let finish = skein_kernels::Finish::Rectified;
-            network
-                .linear
-                .forward(&mut self.team, parameters, &codes, finish, &mut batch.unfolded);
+            network.linear.forward(
+                &mut self.team,
+                parameters,
+                &codes,
+                finish,
+                &mut batch.unfolded,
+            );
             network.unfold.multiply(&mut self.team, &batch.unfolded);
             let network = &*network;
-            let mut drawn = by_image(batch.drawn.each_mut().map(|buffer| &mut **buffer), count);
+            let mut drawn = by_image(
+                batch.decoder_maps.each_mut().map(|buffer| &mut **buffer),
+                count,
+            );
             share(
                 &mut self.team,
                 &mut self.members,
                 &mut drawn,
                 |index, images, member| {
                     let images = images.each_mut().map(|image| &mut **image);
-                    network.draw(parameters, index, images, &mut member.columns, &mut member.watch);
+                    network.decoder_forward(
+                        parameters,
+                        index,
+                        images,
+                        &mut member.columns,
+                        &mut member.watch,
+                    );
                 },
             );
             drop(drawn);
-            sigmoids(isa, &mut batch.drawn[3]);
-            seen.extend_from_slice(&batch.drawn[3]);
+            sigmoids(isa, &mut batch.decoder_maps[3]);
+            seen.extend_from_slice(&batch.decoder_maps[3]);
         }
         seen
     }
@@ -250,30 +286,36 @@ impl NativeVae {
         self.published_len
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`NativeVae::published_len`] long.
     pub fn publish(&self, into: &mut [f32]) {
-        assert_eq!(into.len(), self.published_len, "one place for each number");
+        assert_eq!(
+            into.len(),
+            self.published_len,
+            "as many places as parameters"
+        );
         self.order.to_pytorch(&self.parameters, into);
     }
 
-    /// VAE steps done so far.
+    /// Number of VAE steps done so far.
     pub fn updates(&self) -> u64 {
         self.steps
     }
 
-    /// Where the time went since this was last asked.
-    pub fn take_spent(&mut self) -> Spent {
-        let mut spent = Spent::default();
+    /// Returns the time per layer and pass since the last call.
+    pub fn take_times(&mut self) -> LayerTimes {
+        let mut times = LayerTimes::default();
         for member in &mut self.members {
-            spent.add(&std::mem::take(&mut member.watch.spent));
+            times.add(&std::mem::take(&mut member.watch.times));
         }
-        spent
+        times
     }
 
-    /// Floating-point operations of the passes of each layer for an image, in the order of [`LAYERS`] and [`Pass::ALL`]. Pixels have no gradient.
+    /// Floating-point operations per image of each layer's passes, in the order of [`LAYERS`] and
+    /// [`Pass::ALL`]. The first layer has no backward pass: pixels need no gradient.
     pub fn operations(&self) -> [[f64; 3]; 10] {
         let mut operations = self.network.operations().map(|pass| [pass; 3]);
         operations[0][Pass::Backward as usize] = 0.0;
@@ -283,24 +325,35 @@ impl NativeVae {
 
 #[cfg(test)]
 impl NativeVae {
-    /// Makes a tensor's first number something else.
+    /// Sets the first number of a tensor to `value`.
     pub(super) fn spoil(&mut self, tensor: &str, value: f32) {
         let place = self.order.tensor(tensor).start;
         self.parameters[place] = value;
         self.packed = false;
     }
 
-    /// Loss, squared error and divergence, and the whole gradient in PyTorch's order. `noise`: standard normal, `[n, latent]`.
-    pub(super) fn loss_and_gradient(&mut self, images: &[u8], noise: &[f32]) -> ([f32; 3], Vec<f32>) {
+    /// Returns [loss, squared error, divergence], and the whole gradient in PyTorch's order.
+    /// `noise`: standard normal, `[n, latent]`.
+    pub(super) fn loss_and_gradient(
+        &mut self,
+        images: &[u8],
+        noise: &[f32],
+    ) -> ([f32; 3], Vec<f32>) {
         self.noise = noise.to_vec();
-        let Objective {
+        let LossParts {
             loss,
             error,
             divergence,
         } = self.objective(images);
-        let (mut whole, place) = (self.gradient.to_vec(), self.network.unfold.place.weight.clone());
+        let (mut whole, place) = (
+            self.gradient.to_vec(),
+            self.network.unfold.place.weight.clone(),
+        );
         let [first, second] = &mut self.moments;
-        let blocks = self.network.unfold.blocks(&mut self.parameters, [first, second]);
+        let blocks = self
+            .network
+            .unfold
+            .blocks(&mut self.parameters, [first, second]);
         let len = place.len() / blocks.len();
         for (block, into) in blocks.iter().zip(whole[place].chunks_exact_mut(len)) {
             let scratch = &mut self.members[0].unfold;
@@ -313,16 +366,16 @@ impl NativeVae {
 }
 
 impl Stateful for NativeVae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
-        // Whoever asks may change them.
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
+        // The caller may change the parameters.
         self.packed = false;
         let [first, second] = &mut self.moments;
-        // Names of its own: another engine's numbers lie in another order.
+        // Names differ from the other engine's, because the numbers are in another order.
         let parts = [
-            ("parameters", Part::Numbers(&mut self.parameters)),
-            ("adam.first_moment", Part::Numbers(first)),
-            ("adam.second_moment", Part::Numbers(second)),
-            ("adam.steps", Part::Count(&mut self.steps)),
+            ("parameters", StatePart::Numbers(&mut self.parameters)),
+            ("adam.first_moment", StatePart::Numbers(first)),
+            ("adam.second_moment", StatePart::Numbers(second)),
+            ("adam.steps", StatePart::Count(&mut self.steps)),
         ];
         let named = |(name, part)| (format!("vae.native.{name}"), part);
         parts.into_iter().map(named).collect()

@@ -1,4 +1,5 @@
-//! The native engine against libtorch's automatic gradients, and against itself on other instructions and threads.
+//! The native engine against libtorch's automatic gradients, and against itself with other
+//! instructions and threads.
 
 use skein_kernels::Isa;
 use skein_protocol::IMAGE_PIXELS;
@@ -6,7 +7,8 @@ use skein_protocol::config::DecoderName;
 
 use super::*;
 
-/// Depth images of one wall each with a square opening at some place: near, far, and nothing in between.
+/// Depth images of one wall each, with a square opening at a random place. They have only two
+/// depths, near and far.
 pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
     const WIDTH: usize = skein_protocol::IMAGE_WIDTH;
     let mut noise = Noise::new(seed);
@@ -20,7 +22,7 @@ pub(super) fn synthetic_bytes(count: usize, seed: u64) -> Vec<u8> {
     bytes
 }
 
-/// Length of the codes, where it is not said.
+/// Default length of the latent code.
 const LATENT: usize = 32;
 
 fn with_latent(latent: usize) -> VaeSection {
@@ -30,7 +32,7 @@ fn with_latent(latent: usize) -> VaeSection {
     }
 }
 
-/// Both engines with codes of `latent` numbers.
+/// Returns both engines, for codes of `latent` numbers.
 fn both(latent: usize, seed: u64) -> (NativeVae, TorchVae) {
     crate::device::use_threads(1);
     let section = with_latent(latent);
@@ -56,9 +58,11 @@ fn flat(tensor: &Tensor) -> Vec<f32> {
     Vec::try_from(tensor.reshape([-1])).unwrap()
 }
 
-/// Distance of two vectors, as a share of the second one's length.
+/// Distance of two vectors, relative to the length of `expected`.
 fn relative_distance(found: &[f32], expected: &[f32]) -> f64 {
-    let length = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
+    let length = |values: &mut dyn Iterator<Item = f64>| {
+        values.map(|value| value * value).sum::<f64>().sqrt()
+    };
     let difference = found.iter().zip(expected);
     let difference = length(&mut difference.map(|(a, b)| f64::from(*a) - f64::from(*b)));
     difference / length(&mut expected.iter().map(|value| f64::from(*value)))
@@ -70,7 +74,8 @@ fn state(vae: &mut NativeVae) -> Vec<crate::state::NamedTensor> {
 
 #[test]
 fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_precision() {
-    // Seeds of which no sum lies so near nought that rounding takes it across: a ReLU would then be open in one and shut in the other.
+    // Seeds for which no sum is so near zero that rounding changes its sign: a ReLU would then be
+    // open in one engine and shut in the other.
     for (seed, count, latent) in [
         (1, 1, 32),
         (2, 3, 32),
@@ -87,9 +92,10 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
         let (found, gradient) = native.loss_and_gradient(&images, &noise);
 
         let reference = torch.in_double();
-        let (expected, expected_gradient) = reference.loss_and_gradient(&images_from_bytes(&images), &noise);
+        let (expected, expected_gradient) =
+            reference.loss_and_gradient(&images_from_bytes(&images), &noise);
         for (found, expected) in found.iter().zip(expected) {
-            // A divergence near nought is a sum of differences of numbers near one.
+            // A divergence near zero is a sum of differences of numbers near one.
             let error = (f64::from(*found) - expected).abs() / (1.0 + expected);
             assert!(error < 1e-6, "{found} is not {expected}: off by {error}");
         }
@@ -109,7 +115,7 @@ fn losses_and_every_gradient_are_those_of_automatic_differentiation_in_double_pr
 }
 
 #[test]
-fn both_engines_begin_with_the_same_numbers() {
+fn both_engines_start_with_the_same_numbers() {
     for (seed, latent) in [(1, 32), (2, 8), (3, 64)] {
         let (native, torch) = both(latent, seed);
         assert_eq!(native.published_len(), torch.published_len());
@@ -147,7 +153,9 @@ fn twenty_steps_of_both_engines_lead_to_the_same_place() {
     for step in 0..20 {
         let batch = &images[step % 2 * 8 * IMAGE_PIXELS..][..8 * IMAGE_PIXELS];
         let found = native.update(batch, &mut ours).unwrap();
-        let expected = torch.update(&images_from_bytes(batch), &mut theirs).unwrap();
+        let expected = torch
+            .update(&images_from_bytes(batch), &mut theirs)
+            .unwrap();
         let error = (found.loss - expected.loss).abs() / expected.loss;
         assert!(error < 1e-3, "step {step}: {found:?} is not {expected:?}");
     }
@@ -172,25 +180,34 @@ fn neither_threads_nor_instructions_change_a_bit() {
     };
     for latent in [8, 64] {
         let expected = run(latent, Isa::best(), 1);
-        assert!(run(latent, Isa::Portable, 2) == expected, "{latent} numbers");
+        assert!(
+            run(latent, Isa::Portable, 2) == expected,
+            "{latent} numbers"
+        );
     }
     let expected = run(LATENT, Isa::best(), 1);
     for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
-        // The slowest once: 3 threads, of which one has no image.
+        // Portable instructions are slow: only once, with 3 threads, of which one has no image.
         for threads in (1..4).filter(|threads| isa != Isa::Portable || *threads == 3) {
-            assert!(run(LATENT, isa, threads) == expected, "{isa}, {threads} threads");
+            assert!(
+                run(LATENT, isa, threads) == expected,
+                "{isa}, {threads} threads"
+            );
         }
     }
 }
 
 #[test]
-fn an_image_is_encoded_and_seen_the_same_in_any_company() {
+fn an_image_is_encoded_and_reconstructed_the_same_in_any_batch() {
     let (mut vae, images) = (native(1), synthetic_bytes(35, 1));
     let (codes, seen) = (vae.encode(&images), vae.reconstruct(&images));
     for index in [0, 33] {
         let alone = &images[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
         assert_eq!(vae.encode(alone), codes[index * LATENT..][..LATENT]);
-        assert_eq!(vae.reconstruct(alone), seen[index * IMAGE_PIXELS..][..IMAGE_PIXELS]);
+        assert_eq!(
+            vae.reconstruct(alone),
+            seen[index * IMAGE_PIXELS..][..IMAGE_PIXELS]
+        );
     }
 }
 
@@ -203,11 +220,14 @@ fn a_restored_native_vae_continues_bit_for_bit() {
     let expected = vae.update(&images, &mut Noise::new(2)).unwrap();
 
     let mut resumed = native(9);
-    // What it has packed must not outlive what it is restored to.
+    // What it has packed must not survive the restore.
     let _ = resumed.encode(&images);
     resumed.load_named(&stored).unwrap();
     assert_eq!(resumed.updates(), 1);
-    assert_eq!(resumed.update(&images, &mut Noise::new(2)).unwrap(), expected);
+    assert_eq!(
+        resumed.update(&images, &mut Noise::new(2)).unwrap(),
+        expected
+    );
     assert!(state(&mut resumed) == state(&mut vae));
     assert_eq!(resumed.encode(&images), vae.encode(&images));
 }
@@ -225,15 +245,21 @@ fn a_native_vae_learns_to_reproduce_images_it_was_not_trained_on() {
     let mut vae = native(3);
     let mut code_noise = vec![0.0; 16 * LATENT];
     Noise::new(5).fill_normal(&mut code_noise);
-    // Through codes drawn as in training: after so few steps, the code's mean is a code that the decoder has hardly seen.
-    let error = |vae: &mut NativeVae| vae.loss_and_gradient(&unseen, &code_noise).0[1] / IMAGE_PIXELS as f32;
+    // Uses codes sampled as in training: after so few steps, the decoder has hardly seen the mean
+    // itself.
+    let error = |vae: &mut NativeVae| {
+        vae.loss_and_gradient(&unseen, &code_noise).0[1] / IMAGE_PIXELS as f32
+    };
     let untrained = error(&mut vae);
     let mut noise = Noise::new(4);
     for step in 0..24 {
         let batch = &seen[step % 8 * 8 * IMAGE_PIXELS..][..8 * IMAGE_PIXELS];
         let metrics = vae.update(batch, &mut noise).unwrap();
         let parts = metrics.pixel_error * IMAGE_PIXELS as f32 + metrics.divergence;
-        assert!((metrics.loss - parts).abs() < 1e-4 * metrics.loss, "{metrics:?}");
+        assert!(
+            (metrics.loss - parts).abs() < 1e-4 * metrics.loss,
+            "{metrics:?}"
+        );
     }
     let trained = error(&mut vae);
     assert!(
@@ -244,7 +270,7 @@ fn a_native_vae_learns_to_reproduce_images_it_was_not_trained_on() {
 }
 
 #[test]
-fn what_is_not_finite_changes_nothing() {
+fn a_step_that_is_not_finite_changes_nothing() {
     let images = synthetic_bytes(2, 1);
     let infinite = VaeSection {
         kl_weight: f64::INFINITY,
@@ -257,18 +283,22 @@ fn what_is_not_finite_changes_nothing() {
     assert_eq!(refused, UpdateError::NonFinite { tensor, update: 1 });
     assert!(state(&mut vae) == before);
 
-    // Parameters that are not numbers, each of another layer; and one that only gradients meet, for the loss is far from overflowing.
+    // Parameters that are NaN, in different layers.
     let broken = |name: &str, value: f32| {
         let mut vae = native(1);
         vae.spoil(name, value);
         let before = state(&mut vae);
         let refused = vae.update(&images, &mut Noise::new(1)).unwrap_err();
-        // Not a number is not equal to itself.
+        // NaN is not equal to itself, so the text is compared.
         let bits_of = |state: Vec<crate::state::NamedTensor>| format!("{state:?}");
         assert_eq!(bits_of(state(&mut vae)), bits_of(before), "{name}");
         refused
     };
-    for name in ["encoder.conv1.bias", "decoder.conv1.weight", "decoder.conv4.bias"] {
+    for name in [
+        "encoder.conv1.bias",
+        "decoder.conv1.weight",
+        "decoder.conv4.bias",
+    ] {
         let UpdateError::NonFinite { update, .. } = broken(name, f32::NAN);
         assert_eq!(update, 1, "{name}");
     }
@@ -278,14 +308,23 @@ fn what_is_not_finite_changes_nothing() {
 fn a_configuration_gets_its_engine() {
     let mut run = RunSection::default();
     let section = VaeSection::default();
-    assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Native(_)));
+    assert!(matches!(
+        Vae::new(&section, &run, Device::Cpu),
+        Vae::Native(_)
+    ));
     let u_net = VaeSection {
         decoder: DecoderName::UNet,
         ..section.clone()
     };
-    assert!(matches!(Vae::new(&u_net, &run, Device::Cpu), Vae::Libtorch(_)));
+    assert!(matches!(
+        Vae::new(&u_net, &run, Device::Cpu),
+        Vae::Libtorch(_)
+    ));
     run.engine = Some(Engine::Libtorch);
-    assert!(matches!(Vae::new(&section, &run, Device::Cpu), Vae::Libtorch(_)));
+    assert!(matches!(
+        Vae::new(&section, &run, Device::Cpu),
+        Vae::Libtorch(_)
+    ));
 }
 
 #[test]

@@ -1,7 +1,6 @@
-//! The variational auto-encoder: gives the policy its eyes.
+//! The VAE on libtorch: encoder, decoder and loss with automatic gradients.
 //!
-//! It learns to reproduce depth images through a short code, during the first steps of a run, and is then frozen (paper, section 3.3). The
-//! policy sees the code's mean.
+//! It is the reference of the native engine, and the engine for CUDA devices and U-Net decoders.
 
 use skein_protocol::config::VaeSection;
 use skein_protocol::seeds::{Purpose, derive};
@@ -13,38 +12,40 @@ use crate::error::{UpdateError, finite};
 use crate::networks::{Decoder, Encoded, Encoder, Layout, Parameters, pixels};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
-use crate::state::{Part, Stateful};
+use crate::state::{StatePart, Stateful};
 
-/// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, and loses no speed.
+/// Images encoded or reconstructed at once outside of training: bounds memory at some 50 MB, at no
+/// loss of speed.
 const CHUNK: i64 = 64;
 
 /// Encoder, decoder and their optimizer.
 #[derive(Debug)]
 pub struct TorchVae {
-    /// Length of the code.
+    /// Length of the latent code.
     latent: i64,
     encoder: Encoder,
     decoder: Decoder,
-    /// The part that actors need, then the log-variance head, then the decoder.
+    /// Parameters: the part that actors need, then the log-variance head, then the decoder.
     parameters: Parameters,
     optimizer: Adam,
     kl_weight: f64,
 }
 
 /// The loss and its parts, scalars; see [`VaeMetrics`].
-struct Objective {
+struct LossTensors {
     loss: Tensor,
     error: Tensor,
     divergence: Tensor,
 }
 
 impl TorchVae {
-    /// An untrained VAE whose parameters depend on the run's seed alone.
+    /// Returns an untrained VAE; its parameters depend on the run's seed alone.
     pub fn new(section: &VaeSection, run_seed: u64, device: Device) -> Self {
         let mut layout = Layout::default();
         let encoder = Encoder::describe(&mut layout, section.latent);
         let decoder = Decoder::describe(&mut layout, section.latent, section.decoder);
-        let parameters = Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
+        let parameters =
+            Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
         let optimizer = Adam::new(parameters.flat(), section.learning_rate);
         Self {
             latent: section.latent as i64,
@@ -56,15 +57,20 @@ impl TorchVae {
         }
     }
 
-    /// One step of Adam on a minibatch of depth images, `[n, 72, 128]` u8.
+    /// Makes one step of Adam on a minibatch of depth images, `[n, 72, 128]` u8.
     ///
     /// # Errors
-    /// [`UpdateError::NonFinite`] names what was not finite and the step's number; nothing was changed then.
-    pub fn update(&mut self, images: &Tensor, noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
+    /// [`UpdateError::NonFinite`] names the value that was not finite and the step's number;
+    /// nothing has changed then.
+    pub fn update(
+        &mut self,
+        images: &Tensor,
+        noise: &mut Noise,
+    ) -> Result<VaeMetrics, UpdateError> {
         let pixels = pixels(&images.to_device(self.device()));
 
         let code_noise = noise.normal(&[pixels.size()[0], self.latent], pixels.device());
-        let Objective {
+        let LossTensors {
             loss,
             error,
             divergence,
@@ -88,9 +94,11 @@ impl TorchVae {
         })
     }
 
-    /// The loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal noise, `[n, latent]`.
-    fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> Objective {
-        // The code is drawn as mean + std · noise, so that gradients reach mean and std (arXiv:1312.6114, section 2.4).
+    /// Computes the loss and its two parts for these pixels, `[n, 1, 72, 128]`, and standard normal
+    /// noise, `[n, latent]`.
+    fn objective(&self, pixels: &Tensor, code_noise: &Tensor) -> LossTensors {
+        // The code is sampled as mean + std · noise, so that gradients reach mean and std
+        // (arXiv:1312.6114, section 2.4).
         let Encoded {
             mean,
             log_variance,
@@ -101,25 +109,29 @@ impl TorchVae {
 
         let error = squared_error(&reconstructed, pixels);
         let divergence = divergence(&mean, &log_variance);
-        Objective {
+        LossTensors {
             loss: &error + &divergence * self.kl_weight,
             error,
             divergence,
         }
     }
 
-    /// The code's mean for each image, `[n, latent]`. `images`: `[n, 72, 128]` u8, any number of them.
+    /// Returns the latent mean of each image, `[n, latent]`. `images`: `[n, 72, 128]` u8, any
+    /// number of them.
     pub fn encode(&self, images: &Tensor) -> Tensor {
         self.in_chunks(images, |pixels| self.encoder.mean(&self.parameters, pixels))
             .unwrap_or_else(|| Tensor::zeros([0, self.latent], (Kind::Float, self.device())))
     }
 
-    /// Each image as the decoder sees it through the code's mean, `[n, 72, 128]`, depth in [0, 1]. `images`: `[n, 72, 128]` u8.
+    /// Reconstructs each image from its code's mean: `[n, 72, 128]` u8 to `[n, 72, 128]`, depth in
+    /// [0, 1].
     pub fn reconstruct(&self, images: &Tensor) -> Tensor {
         let shape = [-1, IMAGE_HEIGHT as i64, IMAGE_WIDTH as i64];
         self.in_chunks(images, |pixels| {
             let Encoded { mean, maps, .. } = self.encoder.encode(&self.parameters, pixels);
-            self.decoder.forward(&self.parameters, &mean, &maps).view(shape)
+            self.decoder
+                .forward(&self.parameters, &mean, &maps)
+                .view(shape)
         })
         .unwrap_or_else(|| Tensor::zeros([0, shape[1], shape[2]], (Kind::Float, self.device())))
     }
@@ -129,7 +141,8 @@ impl TorchVae {
         self.encoder.published_len()
     }
 
-    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot layout's order.
+    /// Copies the encoder's part of a snapshot: convolutions and mean head, in the snapshot
+    /// layout's order.
     ///
     /// # Panics
     /// When `into` is not [`TorchVae::published_len`] long.
@@ -137,7 +150,7 @@ impl TorchVae {
         self.parameters.copy_range(0..self.published_len(), into);
     }
 
-    /// VAE steps done so far.
+    /// Number of VAE steps done so far.
     pub fn updates(&self) -> u64 {
         self.optimizer.steps()
     }
@@ -146,7 +159,7 @@ impl TorchVae {
         self.parameters.flat().device()
     }
 
-    /// `None` when there are no images.
+    /// Applies `compute` to chunks of images; `None` when there are no images.
     fn in_chunks(&self, images: &Tensor, compute: impl Fn(&Tensor) -> Tensor) -> Option<Tensor> {
         let _guard = no_grad_guard();
         let count = images.size()[0];
@@ -163,7 +176,7 @@ impl TorchVae {
 
 #[cfg(test)]
 impl TorchVae {
-    /// With its parameters in double precision.
+    /// Converts the parameters to double precision.
     pub(super) fn in_double(mut self) -> Self {
         self.parameters = self.parameters.to_double();
         self
@@ -173,34 +186,40 @@ impl TorchVae {
         self.parameters.layout()
     }
 
-    /// Loss, squared error and divergence in the parameters' precision, and the gradient. `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, latent]`.
+    /// Returns [loss, squared error, divergence] in the parameters' precision, and the gradient.
+    /// `images`: `[n, 72, 128]` u8; `noise`: standard normal, `[n, latent]`.
     pub(super) fn loss_and_gradient(&self, images: &Tensor, noise: &[f32]) -> ([f64; 3], Vec<f32>) {
         let kind = self.parameters.flat().kind();
         let pixels = pixels(images).to_kind(kind);
-        let noise = Tensor::from_slice(noise).view([-1, self.latent]).to_kind(kind);
-        let Objective {
+        let noise = Tensor::from_slice(noise)
+            .view([-1, self.latent])
+            .to_kind(kind);
+        let LossTensors {
             loss,
             error,
             divergence,
         } = self.objective(&pixels, &noise);
         let values = [&loss, &error, &divergence].map(|scalar| scalar.double_value(&[]));
         let gradient = self.parameters.gradient(&loss).to_kind(Kind::Float);
-        (values, Vec::try_from(gradient).expect("a flat vector of numbers"))
+        (
+            values,
+            Vec::try_from(gradient).expect("a flat vector of numbers"),
+        )
     }
 }
 
 impl Stateful for TorchVae {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let mut parts = self.optimizer.parts("vae.adam");
         parts.push((
             "vae.parameters".into(),
-            Part::Tensor(self.parameters.flat().shallow_clone()),
+            StatePart::Tensor(self.parameters.flat().shallow_clone()),
         ));
         parts
     }
 }
 
-/// Depth images as the VAE takes them, `[n, 72, 128]` u8, from their bytes back to back.
+/// Converts the bytes of depth images, back to back, to a tensor, `[n, 72, 128]` u8.
 ///
 /// # Panics
 /// When the bytes are not whole images.
@@ -214,7 +233,8 @@ fn squared_error(reconstructed: &Tensor, pixels: &Tensor) -> Tensor {
     (reconstructed - pixels).square().sum(None) / pixels.size()[0] as f64
 }
 
-/// Divergence of N(mean, exp(log_variance)) from N(0, 1), summed over the code, mean over the batch (arXiv:1312.6114, appendix B).
+/// Divergence of N(mean, exp(log_variance)) from N(0, 1), summed over the code, mean over the batch
+/// (arXiv:1312.6114, appendix B).
 fn divergence(mean: &Tensor, log_variance: &Tensor) -> Tensor {
     let terms: Tensor = mean.square() + log_variance.exp() - log_variance - 1.0;
     terms.sum(None) * (0.5 / mean.size()[0] as f64)

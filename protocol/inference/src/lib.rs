@@ -1,16 +1,16 @@
 //! Native inference: depth image to latent code, observation to action, without libtorch.
 //!
-//! An actor looks at one image at a time, where a tensor library spends more time on itself than on the network. So the two networks are written out over
-//! the kernels that the learner trains them with; the whole-system tests hold them to the learner's. The learner uses the same encoder to make stored codes anew,
-//! so that all codes in its replay are made alike. A [`Network`] is immutable and shared between threads; what a thread writes
-//! to is its own [`Scratch`], allocated once.
+//! An actor computes one image at a time, for which a tensor library spends more time on overhead
+//! than on the network. So both networks are written with the kernels that the learner trains them
+//! with; whole-system tests compare the two. The learner uses the same encoder to recompute stored
+//! codes, so that all codes in its replay come from the same arithmetic. A [`Network`] is immutable
+//! and shared between threads; each thread writes to its own [`Scratch`], allocated once.
 
 mod encoder;
 mod linear;
 mod policy;
 
 use skein_kernels::Isa;
-use skein_protocol::config::Precision;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::{IMAGE_PIXELS, LatentCode};
@@ -18,7 +18,7 @@ use skein_protocol::{IMAGE_PIXELS, LatentCode};
 pub use encoder::{Encoder, EncoderScratch};
 pub use policy::{ActionDistribution, Policy, PolicyScratch};
 
-/// A snapshot, rearranged to be flown.
+/// Networks of a snapshot, with weights arranged for inference.
 #[derive(Debug)]
 pub struct Network {
     version: PolicyVersion,
@@ -26,44 +26,46 @@ pub struct Network {
     policy: Policy,
 }
 
-/// Working memory of one thread that flies.
+/// Working memory of one thread.
 #[derive(Debug, Default)]
 pub struct Scratch {
     encoder: EncoderScratch,
     policy: PolicyScratch,
 }
 
-/// The encoder of a snapshot alone.
+/// Returns the encoder of a snapshot.
 ///
 /// # Panics
 /// As [`Network::new`].
-pub fn encoder(snapshot: &Snapshot, layout: &SnapshotLayout, precision: Precision) -> Encoder {
-    Encoder::new(Isa::best(), precision, tensors(snapshot, layout))
+pub fn encoder(snapshot: &Snapshot, layout: &SnapshotLayout) -> Encoder {
+    Encoder::new(Isa::best(), tensors(snapshot, layout))
 }
 
+/// Returns a function from a tensor's name to its values.
 fn tensors<'a>(snapshot: &'a Snapshot, layout: &SnapshotLayout) -> impl Fn(&str) -> &'a [f32] {
     |name| {
         let tensor = layout
             .tensor(name)
-            .expect("every layout has the encoder's and the policy's tensors");
+            .expect("every layout has the tensors of encoder and policy");
         &snapshot.values[tensor.range.clone()]
     }
 }
 
 impl Network {
-    /// Rearranges a snapshot's parameters; images are to be encoded in `precision`.
+    /// Arranges a snapshot's parameters for inference.
     ///
     /// # Panics
-    /// When the snapshot is not of this layout; [`Snapshot::receive`] and [`Snapshot::load`] let none such through.
-    pub fn new(snapshot: &Snapshot, layout: &SnapshotLayout, precision: Precision) -> Self {
+    /// If the snapshot does not have this layout, which [`Snapshot::receive`] and
+    /// [`Snapshot::load`] refuse.
+    pub fn new(snapshot: &Snapshot, layout: &SnapshotLayout) -> Self {
         Self {
             version: snapshot.version,
-            encoder: encoder(snapshot, layout, precision),
+            encoder: encoder(snapshot, layout),
             policy: Policy::new(Isa::best(), layout.head(), tensors(snapshot, layout)),
         }
     }
 
-    /// The snapshot's number.
+    /// Policy version of the snapshot.
     pub fn version(&self) -> PolicyVersion {
         self.version
     }

@@ -2,7 +2,7 @@
 
 use skein_kernels::{Finish, Isa, Matrix, Panels, Rows, Start, product};
 
-/// Weights and bias, arranged for [`Linear::apply`].
+/// Weights and bias of a layer, arranged for [`Linear::apply`].
 #[derive(Debug)]
 pub(super) struct Linear {
     /// `[inputs, outputs]`.
@@ -14,32 +14,35 @@ impl Linear {
     /// `weights`: `[outputs, inputs]`, PyTorch's order; `bias`: `[outputs]`.
     ///
     /// # Panics
-    /// When the weights are not as many for each output.
+    /// If the number of weights is not a multiple of the number of outputs.
     pub(super) fn new(isa: Isa, weights: &[f32], bias: &[f32]) -> Self {
         assert!(
             weights.len().is_multiple_of(bias.len()),
-            "as many weights for each output"
+            "the same number of weights for each output"
         );
         Self {
-            weights: Panels::of(isa, Matrix::of_rows(weights, weights.len() / bias.len()).transposed()),
+            weights: Panels::of(
+                isa,
+                Matrix::of_rows(weights, weights.len() / bias.len()).transposed(),
+            ),
             bias: bias.to_vec(),
         }
     }
 
-    /// Outputs.
+    /// Number of outputs.
     pub(super) fn outputs(&self) -> usize {
         self.bias.len()
     }
 
-    /// `finish(bias + weights · input)` into `output`, `[outputs]`.
+    /// Writes `finish(bias + weights · input)` to `output`, `[outputs]`.
     ///
     /// # Panics
-    /// When `input` or `output` has another length.
+    /// If `input` or `output` has another length.
     pub(super) fn apply(&self, input: &[f32], finish: Finish<'_>, output: &mut [f32]) {
         assert_eq!(
             input.len(),
             self.weights.terms(),
-            "as many inputs as the layer has weights for"
+            "the input has the length of a row of weights"
         );
         product(
             Rows::Matrix(input),

@@ -1,6 +1,7 @@
-//! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with noise added (arXiv:1802.09477).
+//! The policy: observation to action, by a squashed Gaussian (arXiv:1812.05905, appendix C) or with
+//! added noise (arXiv:1802.09477).
 //!
-//! Three hidden layers with ReLU, then what [`PolicyHead`] says.
+//! Three hidden layers with ReLU, then a [`PolicyHead`].
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -10,7 +11,7 @@ use skein_protocol::{ACTION, LOG_STD};
 
 use crate::linear::Linear;
 
-/// The policy's parameters, arranged for [`Policy::distribution`].
+/// Parameters of the policy, arranged for [`Policy::distribution`].
 #[derive(Debug)]
 pub struct Policy {
     layers: [Linear; POLICY_LAYERS],
@@ -20,47 +21,56 @@ pub struct Policy {
 /// Working memory of one thread.
 #[derive(Debug, Default)]
 pub struct PolicyScratch {
-    /// Layers alternate between these two.
+    /// Inputs and outputs; layers alternate between the two.
     values: [Vec<f32>; 2],
 }
 
-/// What a policy would do.
+/// Distribution of a policy's action.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ActionDistribution {
-    /// A Gaussian that is squashed into an action, by its parameters before the squashing.
+    /// Gaussian that tanh squashes into an action; the parameters are those before tanh.
     SquashedGaussian {
-        /// `[2]`.
+        /// Mean, `[2]`.
         mean: [f32; ACTION],
         /// Natural logarithm of the standard deviation, `[2]`, within [-20, 2].
         log_std: [f32; ACTION],
     },
-    /// An action, and noise about it.
+    /// Action with added noise.
     Noisy {
-        /// `[2]`, inside (-1, 1).
+        /// Action without noise, `[2]`, inside (-1, 1).
         action: [f32; ACTION],
-        /// Standard deviation.
+        /// Standard deviation of the noise.
         std: f32,
     },
 }
 
 impl Policy {
-    /// Takes the parameters by their names in a snapshot (`policy.layer1.weight`, …), each a slice in PyTorch's order.
+    /// `tensor` returns a parameter by its name in a snapshot (`policy.layer1.weight`, …), as a
+    /// slice in PyTorch's order.
     ///
     /// # Panics
-    /// When a tensor has not the length its shape asks for.
+    /// If a tensor does not have the length of its shape.
     pub fn new<'a>(isa: Isa, head: PolicyHead, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
         let layers = std::array::from_fn(|index| {
             let name = format!("policy.layer{}", index + 1);
-            Linear::new(isa, tensor(&format!("{name}.weight")), tensor(&format!("{name}.bias")))
+            Linear::new(
+                isa,
+                tensor(&format!("{name}.weight")),
+                tensor(&format!("{name}.bias")),
+            )
         });
         Self { layers, head }
     }
 
-    /// The distribution of actions for an observation, `[View::len]`.
+    /// Returns the distribution of the action for an observation, `[ObservationLayout::len]`.
     ///
     /// # Panics
-    /// When `observation` has not the length the policy was trained on.
-    pub fn distribution(&self, observation: &[f32], scratch: &mut PolicyScratch) -> ActionDistribution {
+    /// If `observation` does not have the length that the policy was trained on.
+    pub fn distribution(
+        &self,
+        observation: &[f32],
+        scratch: &mut PolicyScratch,
+    ) -> ActionDistribution {
         let [input, output] = &mut scratch.values;
         input.clear();
         input.extend_from_slice(observation);
@@ -75,7 +85,9 @@ impl Policy {
         match self.head {
             PolicyHead::SquashedGaussian => ActionDistribution::SquashedGaussian {
                 mean: std::array::from_fn(|axis| outputs[axis]),
-                log_std: std::array::from_fn(|axis| outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)),
+                log_std: std::array::from_fn(|axis| {
+                    outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)
+                }),
             },
             PolicyHead::Noisy(std) => ActionDistribution::Noisy {
                 action: std::array::from_fn(|axis| outputs[axis].tanh()),
@@ -86,7 +98,7 @@ impl Policy {
 }
 
 impl ActionDistribution {
-    /// The action without noise, each command in [-1, 1].
+    /// Returns the action without noise, each command in [-1, 1].
     pub fn mode(&self) -> [f32; ACTION] {
         match self {
             Self::SquashedGaussian { mean, .. } => mean.map(f32::tanh),
@@ -94,12 +106,14 @@ impl ActionDistribution {
         }
     }
 
-    /// An action drawn at random, each command in [-1, 1].
+    /// Draws an action, each command in [-1, 1].
     pub fn sample(&self, rng: &mut impl Rng) -> [f32; ACTION] {
         std::array::from_fn(|axis| {
             let noise: f32 = StandardNormal.sample(rng);
             match self {
-                Self::SquashedGaussian { mean, log_std } => (mean[axis] + log_std[axis].exp() * noise).tanh(),
+                Self::SquashedGaussian { mean, log_std } => {
+                    (mean[axis] + log_std[axis].exp() * noise).tanh()
+                }
                 Self::Noisy { action, std } => (action[axis] + std * noise).clamp(-1.0, 1.0),
             }
         })
@@ -115,7 +129,7 @@ mod tests {
     const OBSERVATION: usize = 34;
     const WIDTH: usize = 5;
 
-    /// Parameters by a fixed rule; small, so that no unit is always off.
+    /// Returns parameters by a fixed rule; small, so that no unit is always off.
     fn parameters(name: &str) -> Vec<f32> {
         let sizes = [OBSERVATION, WIDTH, WIDTH, WIDTH, 2 * ACTION];
         let layer = usize::from(name.as_bytes()["policy.layer".len()] - b'0');
@@ -143,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn layers_are_those_written_out_by_hand() {
+    fn layers_match_a_calculation_by_hand() {
         let observation: Vec<f32> = (0..OBSERVATION).map(|index| (index as f32).cos()).collect();
         let mut values = observation.clone();
         for layer in 1..=POLICY_LAYERS {
@@ -153,13 +167,20 @@ mod tests {
                 .map(|out| {
                     let row = &weights[out * values.len()..][..values.len()];
                     let sum = bias[out] + row.iter().zip(&values).map(|(w, x)| w * x).sum::<f32>();
-                    if layer < POLICY_LAYERS { sum.max(0.0) } else { sum }
+                    if layer < POLICY_LAYERS {
+                        sum.max(0.0)
+                    } else {
+                        sum
+                    }
                 })
                 .collect();
         }
         let (mean, log_std) = gaussian(&policy(), &observation);
         for axis in 0..ACTION {
-            assert!((mean[axis] - values[axis]).abs() < 1e-6, "{mean:?} {values:?}");
+            assert!(
+                (mean[axis] - values[axis]).abs() < 1e-6,
+                "{mean:?} {values:?}"
+            );
             assert!(
                 (log_std[axis] - values[ACTION + axis]).abs() < 1e-6,
                 "{log_std:?} {values:?}"
@@ -168,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_have_the_stated_mean_and_spread_and_stay_within_bounds() {
+    fn samples_have_the_stated_mean_and_deviation_and_stay_within_bounds() {
         let distribution = ActionDistribution::SquashedGaussian {
             mean: [0.5, -3.0],
             log_std: [-1.0, 2.0],
@@ -178,9 +199,17 @@ mod tests {
         assert!(draws.iter().flatten().all(|command| command.abs() <= 1.0));
         let before_squashing: Vec<f32> = draws.iter().map(|action| action[0].atanh()).collect();
         let mean = before_squashing.iter().sum::<f32>() / draws.len() as f32;
-        let variance = before_squashing.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / draws.len() as f32;
+        let variance = before_squashing
+            .iter()
+            .map(|x| (x - mean).powi(2))
+            .sum::<f32>()
+            / draws.len() as f32;
         assert!((mean - 0.5).abs() < 0.01, "{mean}");
-        assert!((variance.sqrt() - (-1f32).exp()).abs() < 0.01, "{}", variance.sqrt());
+        assert!(
+            (variance.sqrt() - (-1f32).exp()).abs() < 0.01,
+            "{}",
+            variance.sqrt()
+        );
     }
 
     #[test]
@@ -193,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn an_extreme_spread_is_bounded() {
+    fn an_extreme_standard_deviation_is_bounded() {
         let wild = Policy::new(Isa::best(), PolicyHead::SquashedGaussian, |name| {
             let mut values = parameters(name);
             if name == "policy.layer4.bias" {
@@ -214,14 +243,21 @@ mod tests {
         assert_eq!(distribution.mode(), [0.2, 0.95]);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let draws: Vec<_> = (0..20_000).map(|_| distribution.sample(&mut rng)).collect();
-        let (mean, count) = (draws.iter().map(|draw| draw[0]).sum::<f32>() / 2e4, draws.len() as f32);
-        let variance = draws.iter().map(|draw| (draw[0] - mean).powi(2)).sum::<f32>() / count;
+        let (mean, count) = (
+            draws.iter().map(|draw| draw[0]).sum::<f32>() / 2e4,
+            draws.len() as f32,
+        );
+        let variance = draws
+            .iter()
+            .map(|draw| (draw[0] - mean).powi(2))
+            .sum::<f32>()
+            / count;
         assert!(
             (mean - 0.2).abs() < 3e-3 && (variance.sqrt() - 0.1).abs() < 3e-3,
             "{mean} {variance}"
         );
         let at_the_bound = draws.iter().filter(|draw| draw[1] == 1.0).count() as f32 / count;
-        // Half a standard deviation away: 31 % of a Gaussian lie beyond.
+        // The bound is half a standard deviation away; 31 % of a Gaussian lie beyond it.
         assert!(
             draws.iter().all(|draw| draw[1] <= 1.0) && (at_the_bound - 0.309).abs() < 0.02,
             "{at_the_bound}"

@@ -1,6 +1,7 @@
-//! What encoding an image costs as images grow: the encoder's four convolutions on the kernels it is made of, one image at a time.
+//! Time to encode an image as images grow: the encoder's four convolutions, one image at a time.
 //!
-//! The system's images have one size; the kernels have none, so the same layers can be tried on others.
+//! The system's images have a fixed size. The kernels accept any, so the same layers can be
+//! measured with others.
 
 use std::hint::black_box;
 
@@ -22,7 +23,14 @@ struct Layer {
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     let mut group = criterion.benchmark_group("image_size");
-    for [height, width] in [[54, 96], [72, 128], [108, 192], [144, 256], [216, 384], [288, 512]] {
+    for [height, width] in [
+        [54, 96],
+        [72, 128],
+        [108, 192],
+        [144, 256],
+        [216, 384],
+        [288, 512],
+    ] {
         let (mut layers, operations) = encoder([height, width]);
         let image = vec![0.5; height * width];
         group.throughput(Throughput::Elements(operations));
@@ -47,7 +55,7 @@ fn main() {
     criterion.final_summary();
 }
 
-/// The layers for images of `size` (height, width), and floating-point operations of all of them.
+/// Returns the layers for images of `size` (height, width), and their floating-point operations.
 fn encoder(mut size: [usize; 2]) -> (Vec<Layer>, u64) {
     let mut operations = 0;
     let layers = CHANNELS.windows(2).map(|channels| {

@@ -1,4 +1,4 @@
-//! Prints how near the kernels come to what a core can do at most.
+//! Prints the rate of each kernel as a share of the core's peak.
 //!
 //! `cargo run --release -p skein-kernels --example kernel_rates`
 
@@ -16,7 +16,8 @@ fn best(mut work: impl FnMut()) -> f64 {
     best
 }
 
-/// Numbers of no pattern, in [-1, 1): a processor that multiplies the same number again and again draws less power, and may run faster than it ever will in earnest.
+/// Pseudo-random numbers in [-1, 1). A processor that multiplies the same number again and again
+/// draws less power, and may run faster than with real data.
 fn noise(len: usize) -> Vec<f32> {
     let mut state = 0x9e37_79b9_7f4a_7c15_u64;
     let next = || {
@@ -59,7 +60,15 @@ fn main() {
         report(
             &format!("product {m}x{k}x{n}"),
             (2 * m * k * n) as f64,
-            best(|| product(Rows::Matrix(&a), &panels, Start::Bias(&bias), Finish::Rectified, &mut c)),
+            best(|| {
+                product(
+                    Rows::Matrix(&a),
+                    &panels,
+                    Start::Bias(&bias),
+                    Finish::Rectified,
+                    &mut c,
+                )
+            }),
         );
         let mut panels = Panels::new(isa);
         report(
@@ -78,7 +87,15 @@ fn main() {
         report(
             "  gradient",
             (2 * m * k * n) as f64,
-            best(|| gradient(&mut team, isa, Matrix::of_rows(&d, n), Terms::Matrix(&a, k), &mut g)),
+            best(|| {
+                gradient(
+                    &mut team,
+                    isa,
+                    Matrix::of_rows(&d, n),
+                    Terms::Matrix(&a, k),
+                    &mut g,
+                )
+            }),
         );
     }
     for (size, ch, kernel, out) in [
@@ -99,25 +116,16 @@ fn main() {
         report(
             &format!("convolution {size:?}x{ch} {kernel:?} to {out}"),
             flops,
-            best(|| product(Rows::Windows(&w, &img), &panels, Start::Zero, Finish::Rectified, &mut c)),
+            best(|| {
+                product(
+                    Rows::Windows(&w, &img),
+                    &panels,
+                    Start::Zero,
+                    Finish::Rectified,
+                    &mut c,
+                )
+            }),
         );
-        if ch % 2 == 0 {
-            let w = Windows::new(size, ch / 2, kernel, 2);
-            let half = |numbers: &[f32]| {
-                let mut pairs = Vec::new();
-                Pair::all_of(isa, numbers, &mut pairs);
-                pairs
-            };
-            let (img, b) = (half(&img), half(&b));
-            let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()).transposed());
-            report(
-                "  in bfloat16",
-                flops,
-                best(|| product(Rows::Windows(&w, &img), &panels, Start::Zero, Finish::Rectified, &mut c)),
-            );
-            let mut pairs = Vec::new();
-            report("  to pairs", flops, best(|| Pair::all_of(isa, &c, &mut pairs)));
-        }
         let mut team = Team::new(1);
         let mut g = vec![0.0; b.len()];
         let imgs = noise(8 * img.len());
@@ -135,9 +143,7 @@ fn main() {
                 )
             }),
         );
-        let cols = noise(w.count() * w.window_len());
         let mut into = vec![0.0; w.image_len()];
-        report("  add back", flops, best(|| w.add_back(isa, &cols, &mut into)));
         let panels = Panels::of(isa, Matrix::of_rows(&b, w.window_len()));
         let mut scratch = Vec::new();
         report(

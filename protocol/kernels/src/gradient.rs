@@ -1,25 +1,30 @@
-//! The gradient of a layer's weights: what came in, times what flows back, summed over everything the weights were used for.
+//! The gradient of a layer's weights: output gradients times inputs, summed over all rows that the
+//! weights were applied to.
 
 use std::cell::RefCell;
 use std::ops::Range;
 
+#[cfg(target_arch = "x86_64")]
+use crate::isa::x86::{Avx2, Avx512};
 use crate::isa::{Isa, Scalar8, Simd};
 use crate::panels::{Aligned, Matrix, Panel, panels};
 use crate::team::{Shared, Team};
-use crate::tile::{Begin, End, Output, Packed, Run, of_height, panel_tile};
+use crate::tile::{Begin, End, Output, Packed, Span, of_height, panel_tile};
 use crate::windows::Windows;
 
-/// Terms done before all elements are put back: both operands' parts then stay in the caches.
+/// Terms added to all elements before the next terms are: both operands' parts then stay in the
+/// caches.
 const TERMS_AT_ONCE: usize = 512;
-/// Numbers between two tiles of the left operand: without them, all tiles would begin in the same few sets of the cache.
+/// Numbers between two tiles of the left operand. Without them, all tiles would begin in the same
+/// few sets of the cache.
 const PADDING: usize = 16;
 
-/// The right operand, a row for each term.
+/// Right operand of a gradient, one row for each term.
 #[derive(Debug, Clone, Copy)]
 pub enum Terms<'a> {
-    /// A matrix, row by row.
+    /// Row-major matrix, and its columns.
     Matrix(&'a [f32], usize),
-    /// What windows on images that lie one behind the other see, a row each.
+    /// Contents of the windows on images that lie one behind the other, one row each.
     Windows(&'a Windows, &'a [f32]),
 }
 
@@ -30,7 +35,7 @@ impl<'a> Terms<'a> {
         }
     }
 
-    /// Where the rows of these terms begin.
+    /// Writes the offsets at which the rows of these terms begin.
     fn starts(&self, terms: Range<usize>, into: &mut Vec<usize>) {
         into.clear();
         match self {
@@ -42,11 +47,11 @@ impl<'a> Terms<'a> {
         }
     }
 
-    /// The runs of memory that hold a panel's columns of a row.
-    fn pieces(&self, panel: Panel) -> Vec<Run> {
+    /// The spans of memory that hold a panel's columns of a row.
+    fn pieces(&self, panel: Panel) -> Vec<Span> {
         let columns = panel.first..panel.first + panel.columns;
         match self {
-            Self::Matrix(..) => vec![Run {
+            Self::Matrix(..) => vec![Span {
                 offset: columns.start,
                 len: columns.len(),
             }],
@@ -61,8 +66,10 @@ impl<'a> Terms<'a> {
         }
     }
 
+    /// Number of terms.
+    ///
     /// # Panics
-    /// When there are no whole rows or images.
+    /// If the data are not whole rows or images.
     fn count(&self) -> usize {
         let (data, len, rows) = match self {
             Self::Matrix(data, columns) => (data, *columns, 1),
@@ -70,33 +77,39 @@ impl<'a> Terms<'a> {
         };
         assert!(
             data.len().is_multiple_of(len),
-            "{} numbers are not whole terms",
+            "{} numbers are not whole rows or images of {len}",
             data.len()
         );
         data.len() / len * rows
     }
 }
 
-/// `output = leftᵀ · right`, `[left's columns, right's columns]`, row-major: the sum over terms, in order, of one row of each.
+/// Computes `output = leftᵀ · right`, `[left's columns, right's columns]`, row-major: the sum over
+/// terms, in order, of the products of one row of each.
 ///
-/// Members of the team share the columns; no sum is split, so that the bits do not depend on how many they are.
+/// Members of the team share the columns. No sum is divided, so the bits do not depend on their
+/// number.
 ///
 /// # Panics
-/// When lengths do not belong together.
+/// If lengths do not match.
 pub fn gradient(team: &mut Team, isa: Isa, left: Matrix<'_>, right: Terms<'_>, output: &mut [f32]) {
-    assert!(isa.is_available(), "{isa} is not to be had here");
+    isa.require();
     let (rows, columns) = (left.columns(), right.columns());
-    assert_eq!(left.rows(), right.count(), "as many terms left as right");
+    assert_eq!(
+        left.rows(),
+        right.count(),
+        "left and right operand have the same number of terms"
+    );
     assert_eq!(
         output.len(),
         rows * columns,
-        "a place for each of {rows} x {columns} elements"
+        "the output has {rows} x {columns} elements"
     );
     let shared = Shared::new(output);
     let width = isa.panel_width();
     team.split(columns.div_ceil(width), 1, |part| {
         let columns = part.start * width..(part.end * width).min(columns);
-        let job = Job {
+        let job = GradientJob {
             isa,
             left,
             right,
@@ -107,8 +120,8 @@ pub fn gradient(team: &mut Team, isa: Isa, left: Matrix<'_>, right: Terms<'_>, o
     });
 }
 
-/// The columns of one member.
-struct Job<'a> {
+/// One member's share: some columns.
+struct GradientJob<'a> {
     isa: Isa,
     left: Matrix<'a>,
     right: Terms<'a>,
@@ -116,12 +129,12 @@ struct Job<'a> {
     output: *mut f32,
 }
 
-/// Memory of one thread, kept from product to product.
+/// Working memory of one thread, kept from call to call.
 #[derive(Default)]
 struct Scratch {
-    left: Aligned<f32>,
-    right: Aligned<f32>,
-    /// Where each term's row of the right operand begins.
+    left: Aligned,
+    right: Aligned,
+    /// Offset of each term's row in the right operand.
     starts: Vec<usize>,
 }
 
@@ -129,7 +142,7 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-impl Job<'_> {
+impl GradientJob<'_> {
     fn run(&self) {
         let terms = self.left.rows();
         if terms == 0 {
@@ -138,32 +151,45 @@ impl Job<'_> {
         SCRATCH.with_borrow_mut(|scratch| {
             for first in (0..terms).step_by(TERMS_AT_ONCE) {
                 let terms = first..(first + TERMS_AT_ONCE).min(terms);
-                let begin = if first == 0 { Begin::Zero } else { Begin::Output };
-                // SAFETY: `gradient` has asked for the instructions and looked at all lengths; this member alone writes its columns.
+                let begin = if first == 0 {
+                    Begin::Zero
+                } else {
+                    Begin::Output
+                };
+                // SAFETY: `gradient` has checked the instructions and all lengths; this member
+                // alone writes its columns.
                 unsafe { do_block(self, terms, scratch, begin) };
             }
         });
     }
 
-    /// The sum of no terms.
+    /// Writes the sums of zero terms.
     fn blank(&self) {
         for row in 0..self.left.columns() {
             for column in self.columns.clone() {
-                // SAFETY: inside the output, in this member's columns.
+                // SAFETY: within the output, in this member's columns.
                 unsafe { *self.output.add(row * self.right.columns() + column) = 0.0 };
             }
         }
     }
 }
 
+/// Adds some terms to the job's elements.
+///
 /// # Safety
-/// The instructions of `job` are there; the terms are; nobody else touches the job's columns of the output.
-unsafe fn do_block(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
-    // SAFETY: as the caller says.
+/// The instructions of `job` are available, and the terms exist. Nothing else accesses the job's
+/// columns of the output.
+unsafe fn do_block(
+    job: &GradientJob<'_>,
+    terms: Range<usize>,
+    scratch: &mut Scratch,
+    begin: Begin,
+) {
+    // SAFETY: guaranteed by the caller.
     unsafe {
         match job.isa {
             #[cfg(target_arch = "x86_64")]
-            Isa::Avx512 | Isa::Avx512Bf16 => avx512(job, terms, scratch, begin),
+            Isa::Avx512 => avx512(job, terms, scratch, begin),
             #[cfg(target_arch = "x86_64")]
             Isa::Avx2 => avx2(job, terms, scratch, begin),
             _ => block::<Scalar8>(job, terms, scratch, begin),
@@ -173,20 +199,25 @@ unsafe fn do_block(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, be
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
-unsafe fn avx512(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
-    // SAFETY: as the caller says.
-    unsafe { block::<crate::isa::x86::Avx512>(job, terms, scratch, begin) }
+unsafe fn avx512(job: &GradientJob<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+    // SAFETY: guaranteed by the caller.
+    unsafe { block::<Avx512>(job, terms, scratch, begin) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn avx2(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
-    // SAFETY: as the caller says.
-    unsafe { block::<crate::isa::x86::Avx2>(job, terms, scratch, begin) }
+unsafe fn avx2(job: &GradientJob<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+    // SAFETY: guaranteed by the caller.
+    unsafe { block::<Avx2>(job, terms, scratch, begin) }
 }
 
 #[inline(always)]
-unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+unsafe fn block<S: Simd>(
+    job: &GradientJob<'_>,
+    terms: Range<usize>,
+    scratch: &mut Scratch,
+    begin: Begin,
+) {
     let (count, rows) = (terms.len(), job.left.columns());
     let apart = count * S::ROWS + PADDING;
     let left = scratch.left.of_len(rows.div_ceil(S::ROWS) * apart);
@@ -198,7 +229,7 @@ unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch
             first: job.columns.start + panel.first,
             ..panel
         };
-        // SAFETY: as the caller says; there is room for a whole panel.
+        // SAFETY: guaranteed by the caller; there is room for a whole panel.
         unsafe { pack_right::<S>(job.right, &scratch.starts, panel, right) };
         for row in (0..rows).step_by(S::ROWS) {
             let tile = Tile {
@@ -206,14 +237,19 @@ unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch
                     data: left[row / S::ROWS * apart..].as_ptr(),
                     stride: S::ROWS,
                 },
-                runs: [Run { offset: 0, len: count }],
+                spans: [Span {
+                    offset: 0,
+                    len: count,
+                }],
                 right: right.as_ptr(),
                 panel,
                 begin,
-                output: job.output.wrapping_add(row * job.right.columns() + panel.first),
+                output: job
+                    .output
+                    .wrapping_add(row * job.right.columns() + panel.first),
                 stride: job.right.columns(),
             };
-            // SAFETY: as the caller says.
+            // SAFETY: guaranteed by the caller.
             unsafe { of_height!(S, (rows - row).min(S::ROWS), tile_of(tile)) };
         }
     }
@@ -221,7 +257,7 @@ unsafe fn block<S: Simd<Term = f32>>(job: &Job<'_>, terms: Range<usize>, scratch
 
 struct Tile {
     left: Packed,
-    runs: [Run; 1],
+    spans: [Span; 1],
     right: *const f32,
     panel: Panel,
     begin: Begin,
@@ -230,12 +266,12 @@ struct Tile {
 }
 
 #[inline(always)]
-unsafe fn tile_of<S: Simd<Term = f32>, const M: usize>(tile: Tile) {
-    // SAFETY: as the caller says.
+unsafe fn tile_of<S: Simd, const M: usize>(tile: Tile) {
+    // SAFETY: guaranteed by the caller.
     unsafe {
         panel_tile::<S, _, M>(
             tile.left,
-            &tile.runs,
+            &tile.spans,
             tile.right,
             tile.panel,
             tile.begin,
@@ -245,7 +281,8 @@ unsafe fn tile_of<S: Simd<Term = f32>, const M: usize>(tile: Tile) {
     }
 }
 
-/// Lays out the left operand's columns as tiles that begin `apart` numbers from each other, term by term. Behind the last column lies whatever was there.
+/// Packs the left operand's columns in tiles, term by term. Tiles begin `apart` numbers from each
+/// other; rows behind the last column keep unspecified values.
 #[inline(always)]
 fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into: &mut [f32]) {
     let (count, columns) = (terms.len(), left.columns());
@@ -255,7 +292,8 @@ fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into:
         let row = left.row(term);
         for tile in 0..whole {
             let (from, to) = (tile * S::ROWS, tile * apart + index * S::ROWS);
-            // SAFETY: the row has `columns` numbers, `into` room for `count` terms of as many tiles as they fill, as asserted.
+            // SAFETY: the row has `columns` numbers, and `into` has room for `count` terms of all
+            // tiles, as asserted.
             unsafe {
                 into.as_mut_ptr()
                     .add(to)
@@ -269,16 +307,17 @@ fn pack_left<S: Simd>(left: Matrix<'_>, terms: Range<usize>, apart: usize, into:
     }
 }
 
-/// Lays out the panel's columns of the right operand, term by term.
+/// Packs the panel's columns of the right operand, term by term.
 ///
 /// # Safety
-/// The terms that begin at `starts` have the panel's columns; `into` has room for as many rows of the panel's width.
+/// The rows that begin at `starts` have the panel's columns; `into` has room for as many rows of
+/// the panel's width.
 #[inline(always)]
 unsafe fn pack_right<S: Simd>(right: Terms<'_>, starts: &[usize], panel: Panel, into: &mut [f32]) {
     let data = right.data().as_ptr();
     let mut row = into.as_mut_ptr();
     let pieces = right.pieces(panel);
-    // SAFETY: as the caller says.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         match &pieces[..] {
             [piece] if piece.len == 2 * S::LANES => {

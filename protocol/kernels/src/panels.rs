@@ -1,32 +1,33 @@
-//! The right operand of a product, packed so that the inner loop reads it from the first byte to the last.
+//! The right operand of a product, packed so that the inner loop reads it from the first byte to
+//! the last.
 //!
-//! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term. Left where it lies, a matrix whose rows are a power of two apart
-//! would fall into a few sets of the cache.
+//! Columns are gathered in panels as wide as a tile, and each panel is laid out term by term.
+//! Unpacked, a matrix whose rows are a power of two apart would fall into a few sets of the cache.
 
 use std::ops::Range;
 
 use crate::isa::Isa;
-use crate::pair::Term;
 
-/// A matrix seen in either direction: element (row, column) lies at `row · row_stride + column · column_stride`.
+/// Matrix seen in either direction: element (row, column) lies at `row · row_stride + column ·
+/// column_stride`.
 #[derive(Debug, Clone, Copy)]
-pub struct Matrix<'a, T = f32> {
-    data: &'a [T],
+pub struct Matrix<'a> {
+    data: &'a [f32],
     rows: usize,
     columns: usize,
     row_stride: usize,
     column_stride: usize,
 }
 
-impl<'a, T> Matrix<'a, T> {
+impl<'a> Matrix<'a> {
     /// `data` as rows of `columns` numbers.
     ///
     /// # Panics
-    /// When there are no whole rows.
-    pub fn of_rows(data: &'a [T], columns: usize) -> Self {
+    /// If `data` is not whole rows.
+    pub fn of_rows(data: &'a [f32], columns: usize) -> Self {
         assert!(
             columns > 0 && data.len().is_multiple_of(columns),
-            "{} numbers are no rows of {columns}",
+            "{} numbers are not whole rows of {columns}",
             data.len()
         );
         Self {
@@ -38,7 +39,7 @@ impl<'a, T> Matrix<'a, T> {
         }
     }
 
-    /// Rows and columns exchanged.
+    /// The transposed matrix.
     pub fn transposed(self) -> Self {
         Self {
             rows: self.columns,
@@ -49,12 +50,16 @@ impl<'a, T> Matrix<'a, T> {
         }
     }
 
-    /// These columns alone.
+    /// The matrix of these columns.
     ///
     /// # Panics
-    /// When there are not so many.
+    /// If the matrix has fewer columns.
     pub fn columns_of(self, columns: Range<usize>) -> Self {
-        assert!(columns.end <= self.columns, "columns {columns:?} of {}", self.columns);
+        assert!(
+            columns.end <= self.columns,
+            "columns {columns:?} of {}",
+            self.columns
+        );
         Self {
             data: &self.data[columns.start * self.column_stride..],
             columns: columns.len(),
@@ -62,22 +67,22 @@ impl<'a, T> Matrix<'a, T> {
         }
     }
 
-    /// A row, whose columns lie side by side.
+    /// A row whose columns lie side by side.
     ///
     /// # Panics
-    /// When they do not, or there is no such row.
-    pub(crate) fn row(&self, row: usize) -> &'a [T] {
+    /// If they do not, or the matrix has no such row.
+    pub(crate) fn row(&self, row: usize) -> &'a [f32] {
         assert_eq!(self.column_stride, 1, "a matrix seen along its rows");
         &self.data[row * self.row_stride..][..self.columns]
     }
 
     /// Number of rows.
-    pub fn rows(&self) -> usize {
+    pub(crate) fn rows(&self) -> usize {
         self.rows
     }
 
     /// Number of columns.
-    pub fn columns(&self) -> usize {
+    pub(crate) fn columns(&self) -> usize {
         self.columns
     }
 }
@@ -85,55 +90,56 @@ impl<'a, T> Matrix<'a, T> {
 /// Numbers in a cache line.
 const LINE: usize = 16;
 
-/// Numbers that begin where a cache line does.
+/// Numbers that fill a cache line.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(64))]
-struct Line<T>([T; LINE]);
+struct CacheLine([f32; LINE]);
 
-/// Memory for numbers or pairs, from the beginning of a cache line; kept from use to use.
+/// Memory that starts at a cache line and is kept from use to use.
 #[derive(Debug, Default)]
-pub(crate) struct Aligned<T> {
-    lines: Vec<Line<T>>,
+pub(crate) struct Aligned {
+    lines: Vec<CacheLine>,
 }
 
-impl<T: Term> Aligned<T> {
-    /// `len` numbers, whatever they are.
-    pub(crate) fn of_len(&mut self, len: usize) -> &mut [T] {
+impl Aligned {
+    /// Returns `len` numbers of unspecified value.
+    pub(crate) fn of_len(&mut self, len: usize) -> &mut [f32] {
         let lines = len.div_ceil(LINE);
         if self.lines.len() < lines {
-            self.lines.resize(lines, Line([T::default(); LINE]));
+            self.lines.resize(lines, CacheLine([0.0; LINE]));
         }
-        // SAFETY: a line is sixteen numbers and nothing else, so `lines` of them are at least `len` numbers side by side, borrowed from `self`.
+        // SAFETY: a line consists of sixteen numbers, so `lines` of them are at least `len` numbers
+        // side by side, borrowed from `self`.
         unsafe { std::slice::from_raw_parts_mut(self.lines.as_mut_ptr().cast(), len) }
     }
 
-    fn as_ptr(&self) -> *const T {
+    fn as_ptr(&self) -> *const f32 {
         self.lines.as_ptr().cast()
     }
 }
 
-/// A packed right operand: [`Panels::terms`] rows, [`Panels::columns`] columns.
+/// Packed right operand of a product: [`Panels::terms`] rows, [`Panels::columns`] columns.
 #[derive(Debug)]
-pub struct Panels<T = f32> {
+pub struct Panels {
     isa: Isa,
     terms: usize,
     columns: usize,
-    data: Aligned<T>,
+    data: Aligned,
 }
 
-/// One panel.
+/// One panel, or full ones side by side.
 #[derive(Clone, Copy)]
 pub(crate) struct Panel {
     /// The first column.
     pub(crate) first: usize,
-    /// Columns that there are.
+    /// Columns that exist.
     pub(crate) columns: usize,
-    /// Columns that are laid out, those behind the last one as noughts: one register or two.
+    /// Columns in memory, a multiple of a register; those behind the last one hold zeros.
     pub(crate) width: usize,
 }
 
-impl<T: Term> Panels<T> {
-    /// Nothing yet, for products with these instructions.
+impl Panels {
+    /// Empty panels for products with these instructions.
     pub fn new(isa: Isa) -> Self {
         Self {
             isa,
@@ -143,8 +149,8 @@ impl<T: Term> Panels<T> {
         }
     }
 
-    /// Takes over a matrix of terms by columns; memory is used again.
-    pub fn pack(&mut self, matrix: Matrix<'_, T>) {
+    /// Packs a matrix, `[terms, columns]`; memory is reused.
+    pub fn pack(&mut self, matrix: Matrix<'_>) {
         (self.terms, self.columns) = (matrix.rows, matrix.columns);
         let (isa, terms) = (self.isa, self.terms);
         let data = self.data.of_len(padded(isa, matrix.columns) * terms);
@@ -155,19 +161,19 @@ impl<T: Term> Panels<T> {
     }
 
     /// [`Panels::pack`] for products with other instructions.
-    pub(crate) fn repack(&mut self, isa: Isa, matrix: Matrix<'_, T>) {
+    pub(crate) fn repack(&mut self, isa: Isa, matrix: Matrix<'_>) {
         self.isa = isa;
         self.pack(matrix);
     }
 
-    /// [`Panels::new`] and [`Panels::pack`].
-    pub fn of(isa: Isa, matrix: Matrix<'_, T>) -> Self {
+    /// Panels that hold this matrix, `[terms, columns]`.
+    pub fn of(isa: Isa, matrix: Matrix<'_>) -> Self {
         let mut panels = Self::new(isa);
         panels.pack(matrix);
         panels
     }
 
-    /// Length of the sums.
+    /// Terms of each sum.
     pub fn terms(&self) -> usize {
         self.terms
     }
@@ -181,8 +187,8 @@ impl<T: Term> Panels<T> {
         self.isa
     }
 
-    /// The panels, as many full ones at a time as asked for while there are.
-    pub(crate) fn groups(&self, size: usize) -> impl Iterator<Item = Panel> + use<T> {
+    /// The panels: groups of `size` full ones first, then the rest one by one.
+    pub(crate) fn groups(&self, size: usize) -> impl Iterator<Item = Panel> + use<> {
         let group = size * self.isa.panel_width();
         let grouped = self.columns / group * group;
         let groups = (0..grouped).step_by(group).map(move |first| Panel {
@@ -197,17 +203,18 @@ impl<T: Term> Panels<T> {
         }))
     }
 
-    /// Where `panel` begins at `term`.
-    pub(crate) fn at(&self, panel: Panel, term: usize) -> *const T {
+    /// Address of `panel` at `term`.
+    pub(crate) fn at(&self, panel: Panel, term: usize) -> *const f32 {
         debug_assert!(term < self.terms.max(1));
-        // Inside the allocation: `pack` has laid out all terms of all panels. Of several panels at once all terms are taken.
+        // Inside the allocation: `pack` has laid out all terms of all panels. Of grouped panels
+        // only term 0 is asked for.
         self.data
             .as_ptr()
             .wrapping_add(panel.first * self.terms + term * panel.width)
     }
 }
 
-/// The panels of so many columns.
+/// The panels of `columns` columns.
 pub(crate) fn panels(isa: Isa, columns: usize) -> impl Iterator<Item = Panel> + use<> {
     let full = isa.panel_width();
     (0..columns).step_by(full).map(move |first| {
@@ -221,12 +228,14 @@ pub(crate) fn panels(isa: Isa, columns: usize) -> impl Iterator<Item = Panel> + 
     })
 }
 
-/// Columns with those laid out behind the last one.
+/// Columns in memory, with those behind the last one.
 fn padded(isa: Isa, columns: usize) -> usize {
-    panels(isa, columns).last().map_or(0, |last| last.first + last.width)
+    panels(isa, columns)
+        .last()
+        .map_or(0, |last| last.first + last.width)
 }
 
-fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut [T]) {
+fn pack_panel(isa: Isa, matrix: Matrix<'_>, panel: Panel, into: &mut [f32]) {
     let Matrix {
         data,
         row_stride,
@@ -237,16 +246,17 @@ fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut
         for (term, row) in into.chunks_exact_mut(panel.width).enumerate() {
             let from = &data[term * row_stride + panel.first..][..panel.columns];
             row[..panel.columns].copy_from_slice(from);
-            row[panel.columns..].fill(T::default());
+            row[panel.columns..].fill(0.0);
         }
         return;
     }
-    // Along the columns, which lie side by side when the matrix is seen transposed; eight at a time, so that lines are written whole.
+    // The numbers of a column lie side by side. Eight columns at a time, so that cache lines are
+    // written whole.
     for first in (0..panel.width).step_by(EIGHT) {
         let columns = panel.columns.saturating_sub(first).min(EIGHT);
         let column = |index: usize| &data[(panel.first + first + index) * column_stride..];
         if columns == EIGHT && row_stride == 1 {
-            let columns: [&[T]; EIGHT] = std::array::from_fn(|index| &column(index)[..matrix.rows]);
+            let columns = std::array::from_fn(|index| &column(index)[..matrix.rows]);
             interleave(isa, columns, into, first, panel.width);
             continue;
         }
@@ -256,7 +266,7 @@ fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut
                 *number = if index < columns {
                     column(index)[term * row_stride]
                 } else {
-                    T::default()
+                    0.0
                 };
             }
         }
@@ -266,13 +276,13 @@ fn pack_panel<T: Term>(isa: Isa, matrix: Matrix<'_, T>, panel: Panel, into: &mut
 /// Columns that are interleaved at a time; a panel's width is a multiple of it.
 const EIGHT: usize = 8;
 
-/// Writes the numbers of eight columns, all of one length, side by side into the rows of `into`, from its column `first` on.
-fn interleave<T: Term>(isa: Isa, columns: [&[T]; EIGHT], into: &mut [T], first: usize, width: usize) {
-    const { assert!(size_of::<T>() == 4, "pairs are moved as numbers are") };
+/// Writes eight columns of equal length side by side into the rows of `into`, from its column
+/// `first` on.
+fn interleave(isa: Isa, columns: [&[f32]; EIGHT], into: &mut [f32], first: usize, width: usize) {
     let terms = columns[0].len();
     assert!(
         columns.iter().all(|column| column.len() == terms),
-        "columns of one length"
+        "columns of equal length"
     );
     assert!(
         into.len() == terms * width && first + EIGHT <= width,
@@ -282,10 +292,11 @@ fn interleave<T: Term>(isa: Isa, columns: [&[T]; EIGHT], into: &mut [T], first: 
     #[cfg(target_arch = "x86_64")]
     if isa >= Isa::Avx2 && isa.is_available() {
         done = terms / EIGHT * EIGHT;
-        // SAFETY: the instructions are there, as just asked; so are `terms` numbers of each column and as many rows, as asserted above.
+        // SAFETY: the instructions are available. Each column has `terms` numbers and `into` has as
+        // many rows, as asserted above.
         unsafe {
-            let columns = columns.map(|column| column.as_ptr().cast());
-            crate::isa::x86::interleave(columns, done, into[first..].as_mut_ptr().cast(), width);
+            let columns = columns.map(<[f32]>::as_ptr);
+            crate::isa::x86::interleave(columns, done, into[first..].as_mut_ptr(), width);
         }
     }
     let _ = isa;

@@ -1,28 +1,32 @@
-//! What a core can do at most, for figures to be compared with.
+//! Peak arithmetic rate of a core, which measured rates are compared with.
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use crate::isa::{Isa, Scalar8, Simd};
 
-/// Independent sums: enough to hide that each addition waits for the one before.
+/// Independent sums: enough to hide that each operation waits for the one before.
 const SUMS: usize = 12;
 /// Rounds of one measurement: about a millisecond.
 const ROUNDS: usize = 1 << 18;
 
-/// Floating-point operations a second that the calling thread reaches in registers alone, a fused multiply-add counted as two. The best of a hundred
-/// measurements: others may be using the machine.
+/// Measures the floating-point operations per second that the calling thread reaches in registers
+/// alone; a fused multiply-add counts as two. The result is the best of a hundred measurements, as
+/// other processes may use the machine.
+///
+/// # Panics
+/// If this machine does not have the instructions.
 pub fn peak_flops(isa: Isa) -> f64 {
-    assert!(isa.is_available(), "{isa} is not to be had here");
+    isa.require();
     let operations = |lanes: usize| (2 * ROUNDS * SUMS * lanes) as f64;
     let mut best = 0.0_f64;
     for _ in 0..100 {
         let begun = Instant::now();
-        // SAFETY: the instructions are there, as just asked.
+        // SAFETY: the instructions are available.
         let lanes = unsafe {
             match isa {
                 #[cfg(target_arch = "x86_64")]
-                Isa::Avx512 | Isa::Avx512Bf16 => avx512(),
+                Isa::Avx512 => avx512(),
                 #[cfg(target_arch = "x86_64")]
                 Isa::Avx2 => avx2(),
                 _ => multiply_add::<Scalar8>(),
@@ -36,21 +40,21 @@ pub fn peak_flops(isa: Isa) -> f64 {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
 unsafe fn avx512() -> usize {
-    // SAFETY: as the caller says.
+    // SAFETY: guaranteed by the caller.
     unsafe { multiply_add::<crate::isa::x86::Avx512>() }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
 unsafe fn avx2() -> usize {
-    // SAFETY: as the caller says.
+    // SAFETY: guaranteed by the caller.
     unsafe { multiply_add::<crate::isa::x86::Avx2>() }
 }
 
-/// Returns the numbers in a register.
+/// Runs one measurement, and returns the count of numbers in a register.
 #[inline(always)]
-unsafe fn multiply_add<S: Simd<Term = f32>>() -> usize {
-    // SAFETY: as the caller says; `store` is given room for a register.
+unsafe fn multiply_add<S: Simd>() -> usize {
+    // SAFETY: guaranteed by the caller; `kept` has room for the widest register.
     unsafe {
         let (factor, mut sums) = (S::splat(black_box(0.5)), [S::splat(black_box(1.0)); SUMS]);
         for _ in 0..ROUNDS {

@@ -1,64 +1,66 @@
-//! Rows times packed panels: every forward pass, and what flows back to a layer's input.
+//! Rows times packed panels: every forward pass, and the gradient of a layer's input.
 
 use std::cell::RefCell;
 
 use crate::isa::Isa;
-use crate::pair::Term;
+use crate::panel_work::{PanelWork, RowStarts, TERMS_AT_ONCE, do_panel};
 use crate::panels::{Matrix, Panels};
-use crate::tile::{Begin, End, MOST_ROWS, ROW_PANELS, Run};
+use crate::tile::{Begin, End, MOST_ROWS, ROW_PANELS, Span};
 use crate::windows::Windows;
-use crate::work::{Starts, TERMS_AT_ONCE, Work, do_work};
 
-/// Rows that meet all panels before the next ones' turn, and numbers of a matrix's rows: they stay in the second cache meanwhile.
+/// Most rows that pass all panels before the next rows do, and most numbers in such rows: they stay
+/// in the second-level cache meanwhile.
 const ROWS_AT_ONCE: usize = 192;
 const NUMBERS_AT_ONCE: usize = 80 << 10;
 
-/// The left operand: rows of numbers, read where they lie.
+/// Left operand of a product: rows of numbers, read where they lie.
 #[derive(Debug, Clone, Copy)]
-pub enum Rows<'a, T = f32> {
-    /// A matrix, row by row; as many numbers in a row as the product has terms.
-    Matrix(&'a [T]),
-    /// What windows on an image see, a row each.
-    Windows(&'a Windows, &'a [T]),
+pub enum Rows<'a> {
+    /// Row-major matrix, `[rows, terms]`.
+    Matrix(&'a [f32]),
+    /// Contents of the windows on an image, one row each.
+    Windows(&'a Windows, &'a [f32]),
 }
 
-/// What an element's sum begins with.
+/// Initial value of an element's sum.
 #[derive(Debug, Clone, Copy)]
 pub enum Start<'a> {
-    /// Nothing.
+    /// Zero.
     Zero,
     /// Its column's bias, `[columns]`.
     Bias(&'a [f32]),
 }
 
-/// What becomes of a finished sum.
+/// Last operation on a finished sum.
 #[derive(Debug, Clone, Copy)]
 pub enum Finish<'a> {
-    /// Nothing.
+    /// None.
     Plain,
-    /// Zero if it is below zero (ReLU). Not a number stays what it is.
+    /// ReLU: zero if the sum is below zero. NaN stays NaN.
     Rectified,
-    /// Zero where this matrix, `[rows, columns]`, is not above zero: the gradient through a ReLU whose output it is.
+    /// Zero where this matrix, `[rows, columns]`, is not above zero: the gradient through a ReLU
+    /// whose output it is.
     Gated(&'a [f32]),
 }
 
-/// `output = finish(start + rows · panels)`, `[rows, columns]`; everything row-major.
+/// Computes `output = finish(start + rows · panels)`, `[rows, columns]`; all matrices are
+/// row-major.
 ///
-/// Each element is the sum of its terms in order, one fused multiply-add each: the same bits for every instruction set, and however the rows are parted. Of pairs
-/// ([`Pair`](crate::Pair)) the second product is added before the first; the processor's instruction for them takes numbers below 1.2e-38 for nought, the others do not.
+/// Each element is the sum of its terms in order, each added by one fused multiply-add. The bits
+/// depend neither on the instruction set nor on how rows are divided.
 ///
 /// # Panics
-/// When lengths do not belong together.
-pub fn product<T: Term>(
-    rows: Rows<'_, T>,
-    panels: &Panels<T>,
+/// If lengths do not match.
+pub fn product(
+    rows: Rows<'_>,
+    panels: &Panels,
     start: Start<'_>,
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
     let columns = panels.columns();
     check_lens(rows, panels.terms(), columns, start, finish, output.len());
-    let place = Place {
+    let place = OutputColumns {
         stride: columns,
         first: 0,
     };
@@ -69,11 +71,13 @@ thread_local! {
     static PANEL: RefCell<Panels> = RefCell::new(Panels::new(Isa::Portable));
 }
 
-/// [`product`] with a right operand that is packed panel by panel, each just before its turn. For weights that change between any two products: packed at once
-/// and kept, they would be written to memory and read back from there.
+/// [`product`] with a right operand that is packed panel by panel, each just before its use.
+///
+/// For weights that change between any two products. Packed all at once, they would be written to
+/// memory and read back.
 ///
 /// # Panics
-/// When lengths do not belong together.
+/// If lengths do not match.
 pub fn product_once(
     isa: Isa,
     rows: &[f32],
@@ -88,7 +92,7 @@ pub fn product_once(
         for panel in crate::panels::panels(isa, columns) {
             let own = panel.first..panel.first + panel.columns;
             panels.repack(isa, right.columns_of(own.clone()));
-            let place = Place {
+            let place = OutputColumns {
                 stride: columns,
                 first: own.start,
             };
@@ -97,43 +101,47 @@ pub fn product_once(
     });
 }
 
-/// Where the first column of a product lies in its output.
+/// Columns of the output that a product fills.
 #[derive(Clone, Copy)]
-struct Place {
-    /// Columns of the output.
+struct OutputColumns {
+    /// Columns of the whole output.
     stride: usize,
+    /// The first column that is filled.
     first: usize,
 }
 
-/// The product, all lengths looked at. A bias begins with that of the column at `place`.
-fn multiply<T: Term>(
-    rows: Rows<'_, T>,
-    panels: &Panels<T>,
-    place: Place,
+/// Computes the product without checking lengths. Bias and gate are those of the whole output.
+fn multiply(
+    rows: Rows<'_>,
+    panels: &Panels,
+    place: OutputColumns,
     start: Start<'_>,
     finish: Finish<'_>,
     output: &mut [f32],
 ) {
-    assert!(panels.isa().is_available(), "{} is not to be had here", panels.isa());
+    panels.isa().require();
     let count = rows.count(panels.terms());
     let single;
-    let (data, starts, runs) = match rows {
+    let (data, starts, spans) = match rows {
         Rows::Matrix(data) => {
-            single = [Run {
+            single = [Span {
                 offset: 0,
                 len: panels.terms(),
             }];
-            (data, Starts::Even(panels.terms()), &single[..])
+            (data, RowStarts::Even(panels.terms()), &single[..])
         }
-        Rows::Windows(windows, image) => (image, Starts::Listed(windows.starts()), windows.runs()),
+        Rows::Windows(windows, image) => {
+            (image, RowStarts::Listed(windows.starts()), windows.spans())
+        }
     };
-    // A single row meets a number only once, and needs as many sums under way as there are registers.
+    // A single row uses each number of the panels once, and needs as many sums in flight as there
+    // are registers.
     let (terms_at_once, panels_at_once) = if count == 1 {
         (usize::MAX, ROW_PANELS)
     } else {
         (TERMS_AT_ONCE, 1)
     };
-    let blocks = blocks(runs, terms_at_once);
+    let blocks = blocks(spans, terms_at_once);
     let last_block = blocks.len() - 1;
     let rows_at_once = match rows {
         Rows::Matrix(_) => (NUMBERS_AT_ONCE / panels.terms()).clamp(MOST_ROWS, ROWS_AT_ONCE),
@@ -143,12 +151,12 @@ fn multiply<T: Term>(
         for panel in panels.groups(panels_at_once) {
             let column = place.first + panel.first;
             for (index, block) in blocks.iter().enumerate() {
-                let work = Work {
+                let work = PanelWork {
                     left: data.as_ptr(),
                     starts,
                     first,
                     rows: (count - first).min(rows_at_once),
-                    runs: &block.runs,
+                    spans: &block.spans,
                     right: panels.at(panel, block.first_term),
                     terms: panels.terms(),
                     panel,
@@ -164,19 +172,20 @@ fn multiply<T: Term>(
                         Finish::Gated(by) => End::Gated(by[column..].as_ptr()),
                     },
                     output: output[column..].as_mut_ptr(),
-                    output_starts: Starts::Even(place.stride),
+                    output_starts: RowStarts::Even(place.stride),
                 };
-                // SAFETY: `check_lens` has seen to it that every row has all terms, bias, gate and output all columns of all rows; `panels` was packed for
-                // its instructions, which `Isa` has looked for.
-                unsafe { do_work(panels.isa(), &work) };
+                // SAFETY: `check_lens` has checked that every row has all terms, and that bias,
+                // gate and output have all columns of all rows. The instructions that `panels` were
+                // packed for are available, as required above.
+                unsafe { do_panel(panels.isa(), &work) };
             }
         }
     }
 }
 
-/// Looks at all lengths.
-fn check_lens<T: Term>(
-    rows: Rows<'_, T>,
+/// Checks all lengths.
+fn check_lens(
+    rows: Rows<'_>,
     terms: usize,
     columns: usize,
     start: Start<'_>,
@@ -187,11 +196,11 @@ fn check_lens<T: Term>(
     match rows {
         Rows::Matrix(data) => assert!(
             data.len().is_multiple_of(terms),
-            "{} numbers are no rows of {terms}",
+            "{} numbers are not whole rows of {terms}",
             data.len()
         ),
         Rows::Windows(windows, image) => {
-            assert_eq!(image.len(), windows.image_len(), "the image the windows are of");
+            windows.check_image(image);
             assert_eq!(windows.window_len(), terms, "a window has all terms");
         }
     }
@@ -199,7 +208,7 @@ fn check_lens<T: Term>(
     assert_eq!(
         output,
         count * columns,
-        "a place for each of {count} x {columns} elements"
+        "the output has {count} x {columns} elements"
     );
     if let Start::Bias(bias) = start {
         assert_eq!(bias.len(), columns, "a bias for each column");
@@ -209,8 +218,8 @@ fn check_lens<T: Term>(
     }
 }
 
-impl<T> Rows<'_, T> {
-    /// Rows of so many terms.
+impl Rows<'_> {
+    /// Number of rows of `terms` terms.
     fn count(&self, terms: usize) -> usize {
         match self {
             Self::Matrix(data) => data.len() / terms,
@@ -219,31 +228,31 @@ impl<T> Rows<'_, T> {
     }
 }
 
-/// Some of a product's terms.
-struct Block {
+/// Consecutive terms of a product.
+struct TermBlock {
     first_term: usize,
-    runs: Vec<Run>,
+    spans: Vec<Span>,
 }
 
-/// Cuts the terms into blocks of at most so many.
-fn blocks(runs: &[Run], most: usize) -> Vec<Block> {
-    let mut blocks: Vec<Block> = Vec::new();
+/// Cuts the terms into blocks of at most `most`.
+fn blocks(spans: &[Span], most: usize) -> Vec<TermBlock> {
+    let mut blocks: Vec<TermBlock> = Vec::new();
     let (mut first_term, mut room) = (0, 0);
-    for run in runs {
-        let mut run = *run;
-        while run.len > 0 {
+    for span in spans {
+        let mut span = *span;
+        while span.len > 0 {
             if room == 0 {
                 room = most;
-                let runs = Vec::new();
-                blocks.push(Block { first_term, runs });
+                let spans = Vec::new();
+                blocks.push(TermBlock { first_term, spans });
             }
-            let len = run.len.min(room);
+            let len = span.len.min(room);
             if let Some(block) = blocks.last_mut() {
-                block.runs.push(Run { len, ..run });
+                block.spans.push(Span { len, ..span });
             }
-            run = Run {
-                offset: run.offset + len,
-                len: run.len - len,
+            span = Span {
+                offset: span.offset + len,
+                len: span.len - len,
             };
             first_term += len;
             room -= len;

@@ -1,8 +1,9 @@
-//! Threads that do one thing together, many thousand times a second.
+//! Threads that share one piece of work at a time, many thousand times a second.
 //!
-//! An update is some thirty products of a tenth of a millisecond each; waking a thread through the kernel for every one would cost a share of it. So a member looks
-//! for work for a moment before it sleeps. Who does which part follows from numbers alone, and no sum is split between members: results are the same
-//! for any number of them.
+//! An update is some thirty products of a tenth of a millisecond each; waking a thread through the
+//! operating system for each would cost a noticeable share. So a member polls for work for a moment
+//! before it sleeps. Which member computes which part depends on numbers alone, and no sum is
+//! divided between members: results are the same for any number of them.
 
 use std::marker::PhantomData;
 use std::ops::Range;
@@ -11,11 +12,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicPtr, AtomicUsize, Ordering};
 use std::thread::{self, JoinHandle};
 
-/// Looks for work before a member sleeps: some tens of microseconds, as long as the processor pauses between two; longer than what lies between two
-/// products, shorter than what lies between two epochs.
-const LOOKS: usize = 4096;
+/// Polls for work before a member sleeps: some tens of microseconds, depending on how long the
+/// processor pauses. Longer than the time between two products, shorter than that between two
+/// epochs.
+const POLLS: usize = 4096;
 
-/// A fixed number of threads, the caller's among them.
+/// Fixed number of threads, the caller's among them.
 #[derive(Debug)]
 pub struct Team {
     shared: Arc<Round>,
@@ -24,23 +26,23 @@ pub struct Team {
 
 #[derive(Debug)]
 struct Round {
-    /// Counted up for each piece of work, after `work` was set.
+    /// Increased for each piece of work, after `work` was set.
     round: AtomicUsize,
     /// Points to the caller's reference to the work of this round.
-    work: AtomicPtr<Work<'static>>,
+    work: AtomicPtr<TeamWork<'static>>,
     /// Helpers that have not finished this round.
     unfinished: AtomicUsize,
     panicked: AtomicBool,
     over: AtomicBool,
 }
 
-type Work<'a> = &'a (dyn Fn(usize) + Sync);
+type TeamWork<'a> = &'a (dyn Fn(usize) + Sync);
 
 impl Team {
     /// A team of `size` threads, the caller's among them.
     ///
     /// # Panics
-    /// When the system gives no more threads.
+    /// If the system cannot start more threads.
     pub fn new(size: usize) -> Self {
         let shared = Arc::new(Round {
             round: AtomicUsize::new(0),
@@ -55,50 +57,56 @@ impl Team {
                 thread::Builder::new()
                     .name(format!("update-{member}"))
                     .spawn(move || help(&shared, member))
-                    .expect("the system has threads for as many members as it has processors")
+                    .expect("the system can start a thread for each member")
             })
             .collect();
         Self { shared, helpers }
     }
 
-    /// Members, the caller among them.
+    /// Number of members, the caller among them.
     pub fn size(&self) -> usize {
         self.helpers.len() + 1
     }
 
-    /// Lets every member do `work` with its number, from 0, and waits for all.
+    /// Calls `work` once in every member, with its number from 0, and waits for all.
     ///
     /// # Panics
-    /// When one of them does.
-    pub fn run(&mut self, work: impl Fn(usize) + Sync) {
+    /// If a member panics.
+    fn run(&mut self, work: &(dyn Fn(usize) + Sync)) {
         if self.helpers.is_empty() {
             return work(0);
         }
         let shared = &*self.shared;
-        let mut work: Work<'_> = &work;
-        shared.unfinished.store(self.helpers.len(), Ordering::Relaxed);
+        let mut work: TeamWork<'_> = work;
+        shared
+            .unfinished
+            .store(self.helpers.len(), Ordering::Relaxed);
         shared.work.store((&raw mut work).cast(), Ordering::Relaxed);
         shared.round.fetch_add(1, Ordering::Release);
         for helper in &self.helpers {
             helper.thread().unpark();
         }
-        // Nobody may look at `work` once this returns, not even by a panic.
+        // No helper may use `work` once this returns, even by a panic.
         let own = catch_unwind(AssertUnwindSafe(|| work(0)));
-        let mut looks = 0;
+        let mut polls = 0;
         while shared.unfinished.load(Ordering::Acquire) > 0 {
-            pause(&mut looks, thread::yield_now);
+            pause(&mut polls, thread::yield_now);
         }
         let helper_panicked = shared.panicked.swap(false, Ordering::Relaxed);
         if let Err(panic) = own {
             resume_unwind(panic);
         }
-        assert!(!helper_panicked, "a helper panicked; its message is above");
+        assert!(
+            !helper_panicked,
+            "a helper thread panicked; its message is above"
+        );
     }
 
-    /// Lets every member do a part of `0..count`, in whole multiples of `grain` but for the last.
+    /// Divides `0..count` among the members, and calls `work` for each part. Parts begin at
+    /// multiples of `grain`.
     pub fn split(&mut self, count: usize, grain: usize, work: impl Fn(Range<usize>) + Sync) {
         let size = self.size();
-        self.run(|member| {
+        self.run(&|member| {
             let part = part(count, grain, member, size);
             if !part.is_empty() {
                 work(part);
@@ -106,10 +114,11 @@ impl Team {
         });
     }
 
-    /// Lets every member do a part of the rows of `rows`, each `len` long: `work` is given the number of its first row and the rows.
+    /// Divides rows of length `len` among the members. `work` receives the number of its first row,
+    /// and its rows.
     ///
     /// # Panics
-    /// When `rows` are not whole ones.
+    /// If `rows` are not whole rows.
     pub fn split_rows<T: Send>(
         &mut self,
         rows: &mut [T],
@@ -121,7 +130,7 @@ impl Team {
         let count = rows.len() / len;
         let rows = Shared::new(rows);
         self.split(count, grain, |part| {
-            // SAFETY: `split` gives each member a part of its own.
+            // SAFETY: the parts of `split` do not overlap.
             let own = unsafe { rows.part(part.start * len..part.end * len) };
             work(part.start, own);
         });
@@ -138,7 +147,7 @@ impl Drop for Team {
     }
 }
 
-/// Memory that members of a team write, each in parts of its own.
+/// Memory that members of a team write, each in other parts.
 pub(crate) struct Shared<'a, T> {
     data: *mut T,
     len: usize,
@@ -158,40 +167,47 @@ impl<'a, T> Shared<'a, T> {
         self.data
     }
 
+    /// Returns a part of the memory.
+    ///
     /// # Safety
-    /// Nobody else is given any of this part meanwhile.
-    #[allow(clippy::mut_from_ref, reason = "the caller gives each part to one member")]
+    /// No other borrow of this part exists meanwhile.
+    #[allow(clippy::mut_from_ref, reason = "the caller keeps parts apart")]
     pub(crate) unsafe fn part(&self, part: Range<usize>) -> &mut [T] {
-        assert!(part.start <= part.end && part.end <= self.len, "a part of the memory");
-        // SAFETY: inside of what was lent, and nobody else's, the caller says.
+        assert!(
+            part.start <= part.end && part.end <= self.len,
+            "a part of the memory"
+        );
+        // SAFETY: within the borrowed memory, as asserted; exclusive, as the caller guarantees.
         unsafe { std::slice::from_raw_parts_mut(self.data.add(part.start), part.len()) }
     }
 }
 
-// SAFETY: it is given out in parts that do not overlap, to threads that `T` may be sent to.
+// SAFETY: parts do not overlap, and `T` may be sent to the threads that use them.
 unsafe impl<T: Send> Sync for Shared<'_, T> {}
 
-/// The part of `0..count` that is `member`'s, of `size` members.
+/// Part of `0..count` for `member` of `size` members.
 fn part(count: usize, grain: usize, member: usize, size: usize) -> Range<usize> {
     let grains = count.div_ceil(grain);
     let at = |member: usize| (grains * member / size * grain).min(count);
     at(member)..at(member + 1)
 }
 
+/// Loop of a helper thread.
 fn help(shared: &Round, member: usize) {
     let mut done = 0;
     loop {
-        let mut looks = 0;
+        let mut polls = 0;
         while shared.round.load(Ordering::Acquire) == done {
             if shared.over.load(Ordering::Acquire) {
                 return;
             }
-            pause(&mut looks, thread::park);
+            pause(&mut polls, thread::park);
         }
         done += 1;
         let work = shared.work.load(Ordering::Relaxed);
         let outcome = catch_unwind(AssertUnwindSafe(|| {
-            // SAFETY: `run` has set the pointer before the round, and does not return, so that what it points to lives, until `unfinished` is nought.
+            // SAFETY: `run` has set the pointer before the round. What it points to lives until
+            // `run` returns, which is after `unfinished` has become zero.
             let work = unsafe { *work };
             work(member);
         }));
@@ -202,10 +218,10 @@ fn help(shared: &Round, member: usize) {
     }
 }
 
-/// Waits for a moment; after [`LOOKS`] moments, by `longer`.
-fn pause(looks: &mut usize, longer: fn()) {
-    if *looks < LOOKS {
-        *looks += 1;
+/// Waits for a moment; after [`POLLS`] calls, by calling `longer`.
+fn pause(polls: &mut usize, longer: fn()) {
+    if *polls < POLLS {
+        *polls += 1;
         std::hint::spin_loop();
     } else {
         longer();
@@ -217,7 +233,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_part_is_done_once_by_any_number_of_members() {
+    fn every_part_is_computed_once_by_any_number_of_members() {
         for size in 1..=5 {
             let mut team = Team::new(size);
             for count in [0, 1, 7, 64, 65] {
@@ -225,7 +241,8 @@ mod tests {
                 for _ in 0..50 {
                     team.split_rows(&mut rows, 3, 4, |first, rows| {
                         for (index, row) in rows.chunks_exact_mut(3).enumerate() {
-                            row.iter_mut().for_each(|value| *value += (first + index) as u32);
+                            row.iter_mut()
+                                .for_each(|value| *value += (first + index) as u32);
                         }
                     });
                 }
@@ -236,12 +253,12 @@ mod tests {
     }
 
     #[test]
-    fn a_member_that_sleeps_is_woken() {
+    fn a_sleeping_member_is_woken() {
         let mut team = Team::new(2);
         for _ in 0..3 {
             thread::sleep(std::time::Duration::from_millis(20));
             let done = AtomicUsize::new(0);
-            team.run(|_| {
+            team.run(&|_| {
                 done.fetch_add(1, Ordering::Relaxed);
             });
             assert_eq!(done.into_inner(), 2);
@@ -249,16 +266,16 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_of_any_member_reaches_the_caller_and_the_team_lives_on() {
+    fn a_panic_of_any_member_reaches_the_caller_and_the_team_still_works() {
         let mut team = Team::new(2);
         for member in 0..2 {
             let outcome = catch_unwind(AssertUnwindSafe(|| {
-                team.run(|number| assert_ne!(number, member, "on purpose"));
+                team.run(&|number| assert_ne!(number, member, "on purpose"));
             }));
             assert!(outcome.is_err());
         }
         let done = AtomicUsize::new(0);
-        team.run(|_| {
+        team.run(&|_| {
             done.fetch_add(1, Ordering::Relaxed);
         });
         assert_eq!(done.into_inner(), 2);

@@ -1,10 +1,10 @@
-//! Products and gradients against their definition, and every instruction set against every other, bit for bit.
+//! Products and gradients compared with their definition, bit for bit, for every instruction set.
 
 use proptest::prelude::*;
 
 use crate::*;
 
-/// Numbers of no pattern, in [-1, 1).
+/// Pseudo-random numbers in [-1, 1).
 fn numbers(len: usize, seed: u64) -> Vec<f32> {
     let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     (0..len)
@@ -17,16 +17,11 @@ fn numbers(len: usize, seed: u64) -> Vec<f32> {
         .collect()
 }
 
-fn pairs(len: usize, seed: u64) -> Vec<Pair> {
-    let numbers = numbers(2 * len, seed);
-    numbers.chunks(2).map(|two| Pair::of(two[0], two[1])).collect()
-}
-
 fn available() -> impl Iterator<Item = Isa> {
     Isa::ALL.into_iter().filter(|isa| isa.is_available())
 }
 
-/// The definition: every element's terms in order, one fused multiply-add each.
+/// The definition of a product: each element's terms in order, one fused multiply-add each.
 fn defined(
     rows: &[Vec<f32>],
     right: impl Fn(usize, usize) -> f32,
@@ -39,7 +34,11 @@ fn defined(
             left.mul_add(right(term, column), sum)
         })
     };
-    let elements = |row: &Vec<f32>| (0..columns).map(|column| element(row, column)).collect::<Vec<f32>>();
+    let elements = |row: &Vec<f32>| {
+        (0..columns)
+            .map(|column| element(row, column))
+            .collect::<Vec<f32>>()
+    };
     rows.iter().flat_map(elements).collect()
 }
 
@@ -48,7 +47,11 @@ proptest! {
 
     #[test]
     fn a_product_is_its_definition_to_the_last_bit(
-        count in 0_usize..40, terms in 1_usize..600, columns in 1_usize..70, way in 0..4, seed in 1_u64..1000,
+        count in 0_usize..40,
+        terms in 1_usize..600,
+        columns in 1_usize..70,
+        way in 0..4,
+        seed in 1_u64..1000,
     ) {
         let (left, right) = (numbers(count * terms, seed), numbers(terms * columns, seed + 1));
         let (bias, gate) = (numbers(columns, seed + 2), numbers(count * columns, seed + 3));
@@ -57,7 +60,10 @@ proptest! {
         } else {
             Matrix::of_rows(&right, terms).transposed()
         };
-        let at = |term: usize, column: usize| if way % 2 == 0 { right[term * columns + column] } else { right[column * terms + term] };
+        let at = |term: usize, column: usize| match way % 2 {
+            0 => right[term * columns + column],
+            _ => right[column * terms + term],
+        };
         let rows: Vec<Vec<f32>> = left.chunks(terms).map(<[f32]>::to_vec).collect();
         let (start, finish) = match way {
             0 => (Start::Zero, Finish::Plain),
@@ -65,7 +71,8 @@ proptest! {
             2 => (Start::Zero, Finish::Gated(&gate)),
             _ => (Start::Bias(&bias), Finish::Plain),
         };
-        let mut expected = defined(&rows, at, columns, |column| if way % 2 == 0 { 0.0 } else { bias[column] });
+        let begin = |column: usize| if way % 2 == 0 { 0.0 } else { bias[column] };
+        let mut expected = defined(&rows, at, columns, begin);
         for (element, gate) in expected.iter_mut().zip(&gate) {
             if way == 1 && *element < 0.0 || way == 2 && *gate <= 0.0 {
                 *element = 0.0;
@@ -82,87 +89,69 @@ proptest! {
     }
 
     #[test]
-    fn a_product_of_pairs_is_its_definition_to_the_last_bit(
-        count in 0_usize..30, terms in 1_usize..400, columns in 1_usize..300, seed in 1_u64..1000,
-    ) {
-        let (left, right) = (pairs(count * terms, seed), pairs(terms * columns, seed + 1));
-        let bias = numbers(columns, seed + 2);
-        let expected: Vec<f32> = (0..count * columns)
-            .map(|element| {
-                let (row, column) = (element / columns, element % columns);
-                let sum = (0..terms).fold(bias[column], |sum, term| {
-                    let ([a, c], [b, d]) = (left[row * terms + term].numbers(), right[term * columns + column].numbers());
-                    a.mul_add(b, c.mul_add(d, sum))
-                });
-                sum.max(0.0)
-            })
-            .collect();
-        for isa in available() {
-            let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
-            let mut output = vec![f32::NAN; count * columns];
-            product(Rows::Matrix(&left), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
-            prop_assert_eq!(&output, &expected, "{}", isa);
-            // Seen the other way, as weights lie; and a window that is the whole image.
-            let across: Vec<Pair> = (0..columns * terms).map(|at| right[at % terms * columns + at / terms]).collect();
-            let panels = Panels::of(isa, Matrix::of_rows(&across, terms).transposed());
-            let windows = Windows::new([1, terms], 1, [1, terms], 1);
-            for (row, expected) in left.chunks(terms).zip(expected.chunks(columns)) {
-                let mut output = vec![f32::NAN; columns];
-                product(Rows::Windows(&windows, row), &panels, Start::Bias(&bias), Finish::Rectified, &mut output);
-                prop_assert_eq!(&output[..], expected, "{}", isa);
-            }
-        }
-    }
-
-    #[test]
     fn a_convolution_is_its_definition_and_so_is_its_gradient(
-        height in 1_usize..9, width in 1_usize..9, channels in 1_usize..20, kernel_height in 1_usize..4, kernel_width in 1_usize..4,
-        stride in 1_usize..3, outputs in 1_usize..20, images in 1_usize..4, seed in 1_u64..1000,
+        size in [1_usize..9, 1_usize..9],
+        channels in 1_usize..20,
+        kernel in [1_usize..4, 1_usize..4],
+        stride in 1_usize..3,
+        outputs in 1_usize..20,
+        images in 1_usize..4,
+        seed in 1_u64..1000,
     ) {
-        prop_assume!(kernel_height <= height && kernel_width <= width);
-        let windows = Windows::new([height, width], channels, [kernel_height, kernel_width], stride);
+        prop_assume!(kernel[0] <= size[0] && kernel[1] <= size[1]);
+        let windows = Windows::new(size, channels, kernel, stride);
         let input = numbers(images * windows.image_len(), seed);
         let weights = numbers(outputs * windows.window_len(), seed + 1);
-        let flowing = numbers(images * windows.count() * outputs, seed + 2);
+        let grad = numbers(images * windows.count() * outputs, seed + 2);
         let [_, across] = windows.positions();
         let seen: Vec<Vec<f32>> = input
             .chunks(windows.image_len())
             .flat_map(|image| (0..windows.count()).map(move |window| (image, window)))
             .map(|(image, window)| {
                 let (top, left) = (window / across * stride, window % across * stride);
-                let places = (0..kernel_height).flat_map(|y| (0..kernel_width).map(move |x| (y, x)));
-                places.flat_map(|(y, x)| &image[((top + y) * width + left + x) * channels..][..channels]).copied().collect()
+                let places =
+                    (0..kernel[0]).flat_map(|y| (0..kernel[1]).map(move |x| (top + y, left + x)));
+                let pixel = |(y, x)| &image[(y * size[1] + x) * channels..][..channels];
+                places.flat_map(pixel).copied().collect()
             })
             .collect();
         let len = windows.window_len();
-        let expected = defined(&seen, |term, output| weights[output * len + term], outputs, |_| 0.0);
-        let flowing_columns: Vec<Vec<f32>> = (0..outputs)
-            .map(|output| flowing.iter().skip(output).step_by(outputs).copied().collect())
+        let weight = |term: usize, output: usize| weights[output * len + term];
+        let expected = defined(&seen, weight, outputs, |_| 0.0);
+        let grad_columns: Vec<Vec<f32>> = (0..outputs)
+            .map(|output| grad.iter().skip(output).step_by(outputs).copied().collect())
             .collect();
-        let expected_gradient = defined(&flowing_columns, |term, number| seen[term][number], len, |_| 0.0);
+        let number = |term: usize, number: usize| seen[term][number];
+        let expected_gradient = defined(&grad_columns, number, len, |_| 0.0);
         for isa in available() {
             let panels = Panels::of(isa, Matrix::of_rows(&weights, len).transposed());
             let mut output = vec![f32::NAN; expected.len()];
-            for (image, output) in input.chunks(windows.image_len()).zip(output.chunks_mut(windows.count() * outputs)) {
-                product(Rows::Windows(&windows, image), &panels, Start::Zero, Finish::Plain, output);
+            let output_len = windows.count() * outputs;
+            let input_images = input.chunks(windows.image_len());
+            for (image, output) in input_images.zip(output.chunks_mut(output_len)) {
+                let rows = Rows::Windows(&windows, image);
+                product(rows, &panels, Start::Zero, Finish::Plain, output);
             }
             prop_assert_eq!(&output, &expected, "{}", isa);
             let mut found = vec![f32::NAN; expected_gradient.len()];
-            let flowing = Matrix::of_rows(&flowing, outputs);
-            gradient(&mut Team::new(1), isa, flowing, Terms::Windows(&windows, &input), &mut found);
+            let grad = Matrix::of_rows(&grad, outputs);
+            gradient(&mut Team::new(1), isa, grad, Terms::Windows(&windows, &input), &mut found);
             prop_assert_eq!(&found, &expected_gradient, "{}", isa);
 
-            // What is spread is what is added back of the product, up to the order of sums; and the same with all instructions.
+            // `spread` equals product and `add_back` up to the order of sums, and has the same bits
+            // with all instruction sets.
             let columns = defined(
                 &output.chunks(outputs).map(<[f32]>::to_vec).collect::<Vec<_>>(),
                 |term, number| weights[term * len + number],
                 len,
                 |_| 0.0,
             );
-            let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, Matrix::of_rows(&weights, len)));
-            for (rows, columns) in output.chunks(windows.count() * outputs).zip(columns.chunks(windows.count() * len)) {
+            let weights = Matrix::of_rows(&weights, len);
+            let panels = [Isa::Portable, isa].map(|isa| Panels::of(isa, weights));
+            let columns = columns.chunks(windows.count() * len);
+            for (rows, columns) in output.chunks(output_len).zip(columns) {
                 let mut added = vec![0.5; windows.image_len()];
-                windows.add_back(isa, columns, &mut added);
+                windows.add_back(isa, 0..windows.count(), columns, &mut added);
                 let [portable, found] = panels.each_ref().map(|panels| {
                     let mut image = vec![0.5; windows.image_len()];
                     spread(rows, panels, &windows, &mut Vec::new(), &mut image);
@@ -170,31 +159,41 @@ proptest! {
                 });
                 prop_assert_eq!(&found, &portable, "{}", isa);
                 for (found, added) in found.iter().zip(&added) {
-                    prop_assert!((found - added).abs() <= 1e-4 * (1.0 + added.abs()), "{} is not {}", found, added);
+                    let apart = (found - added).abs();
+                    prop_assert!(apart <= 1e-4 * (1.0 + added.abs()), "{} is not {}", found, added);
                 }
             }
         }
     }
 
     #[test]
-    fn what_is_spread_in_place_is_its_definition_to_the_last_bit(
-        size in [1_usize..8, 1_usize..9], kernel in [1_usize..4, 1_usize..5], stride in 1_usize..4, registers in 1_usize..3,
-        terms in prop_oneof![1_usize..40, 250_usize..300], seed in 1_u64..1000,
+    fn spread_in_place_is_its_definition_to_the_last_bit(
+        size in [1_usize..8, 1_usize..9],
+        kernel in [1_usize..4, 1_usize..5],
+        stride in 1_usize..4,
+        registers in 1_usize..3,
+        terms in prop_oneof![1_usize..40, 250_usize..300],
+        seed in 1_u64..1000,
     ) {
         prop_assume!(kernel[0] <= size[0] && kernel[1] <= size[1]);
         let channels = 32 * registers;
         let windows = Windows::new(size, channels, kernel, stride);
         let (len, [_, across]) = (windows.window_len(), windows.positions());
-        let (rows, weights) = (numbers(windows.count() * terms, seed), numbers(terms * len, seed + 1));
+        let rows = numbers(windows.count() * terms, seed);
+        let weights = numbers(terms * len, seed + 1);
         let held = numbers(windows.image_len(), seed + 2);
-        // Number by number of a window: all windows' terms, one after the other, to what the image holds.
+        // For each number of a window: the terms of all windows in turn, added to the image's
+        // content.
         let mut expected = held.clone();
         for number in 0..len {
             let (y, x) = (number / channels / kernel[1], number / channels % kernel[1]);
             for (window, row) in rows.chunks(terms).enumerate() {
                 let pixel = (window / across * stride + y) * size[1] + window % across * stride + x;
                 let sum = &mut expected[pixel * channels + number % channels];
-                *sum = row.iter().enumerate().fold(*sum, |sum, (term, left)| left.mul_add(weights[term * len + number], sum));
+                let terms = row.iter().enumerate();
+                *sum = terms.fold(*sum, |sum, (term, left)| {
+                    left.mul_add(weights[term * len + number], sum)
+                });
             }
         }
         for isa in available() {
@@ -207,11 +206,11 @@ proptest! {
 }
 
 #[test]
-fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
+fn a_single_row_below_grouped_panels_is_its_definition() {
     for (terms, columns) in [(5, 64), (300, 65), (7, 128), (256, 200), (600, 256)] {
         let (left, right) = (numbers(terms, 1), numbers(terms * columns, 2));
         let (bias, mut gate) = (numbers(columns, 3), numbers(columns, 4));
-        // A ReLU that gave nought lets nothing back.
+        // A ReLU with output zero has no gradient.
         gate[..3].fill(0.0);
         let at = |term: usize, column: usize| right[term * columns + column];
         let rows = [left.clone()];
@@ -225,7 +224,7 @@ fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
             .collect();
         for isa in available() {
             let panels = Panels::of(isa, Matrix::of_rows(&right, columns));
-            // One window on an image of one position is a single row, too.
+            // One window on an image with one position is a single row, too.
             let windows = Windows::new([1, terms], 1, [1, terms], 1);
             for rows in [Rows::Matrix(&left), Rows::Windows(&windows, &left)] {
                 for (start, finish, expected) in [
@@ -244,7 +243,7 @@ fn a_single_row_is_its_definition_under_panels_that_are_met_at_once() {
 
 #[test]
 fn a_gradient_is_its_definition_for_any_number_of_members() {
-    // More terms than are done at once, columns that fill no panel, rows that fill no tile.
+    // More terms than one block, columns that fill no panel, rows that fill no tile.
     for (terms, rows, columns) in [(600, 7, 70), (1, 13, 4), (300, 64, 33), (0, 3, 5)] {
         let (left, right) = (numbers(terms * rows, 1), numbers(terms * columns, 2));
         let by_column: Vec<Vec<f32>> = (0..rows)
@@ -274,7 +273,7 @@ fn a_gradient_is_its_definition_for_any_number_of_members() {
 }
 
 #[test]
-fn what_is_not_a_number_is_not_hidden() {
+fn nan_stays_nan_through_a_relu() {
     let weights = numbers(4 * 20, 1);
     for isa in available() {
         let mut output = [0.0; 20];
@@ -287,12 +286,15 @@ fn what_is_not_a_number_is_not_hidden() {
             Finish::Rectified,
             &mut output,
         );
-        assert!(output.iter().all(|value| value.is_nan()), "{isa}: {output:?}");
+        assert!(
+            output.iter().all(|value| value.is_nan()),
+            "{isa}: {output:?}"
+        );
     }
 }
 
 #[test]
-#[should_panic(expected = "a place for each")]
+#[should_panic(expected = "the output has")]
 fn an_output_that_is_too_short_is_refused() {
     let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 6], 3));
     product(
@@ -318,7 +320,7 @@ fn a_bias_that_is_too_short_is_refused() {
 }
 
 #[test]
-#[should_panic(expected = "the image the windows are of")]
+#[should_panic(expected = "the image has the size that the windows are for")]
 fn an_image_of_another_size_is_refused() {
     let windows = Windows::new([3, 3], 1, [2, 2], 1);
     let panels = Panels::of(Isa::best(), Matrix::of_rows(&[1.0; 4], 1));

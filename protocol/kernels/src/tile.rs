@@ -1,59 +1,62 @@
-//! The inner loop of every product: a tile of the output, held in registers from its first term to its last.
+//! The inner loop of every product: a tile of the output that stays in registers from its first
+//! term to its last.
 //!
-//! An element of the output is the sum of its terms in the order of k, each added by one fused multiply-add. Neither the width of a register nor the
-//! size of a tile changes that, so all instruction sets give the same bits.
+//! An element of the output is the sum of its terms in the order of k, each added by one fused
+//! multiply-add. Neither the width of a register nor the size of a tile changes that, so all
+//! instruction sets give the same bits.
 
 use crate::isa::Simd;
 use crate::panels::Panel;
 
 /// Terms that lie side by side in the left operand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Run {
-    /// From where a row begins.
+pub(crate) struct Span {
+    /// Distance of the first term from the beginning of its row.
     pub(crate) offset: usize,
-    /// How many.
+    /// Number of terms.
     pub(crate) len: usize,
 }
 
-/// What an element's sum begins with.
+/// Initial value of an element's sum.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Begin {
-    /// Nothing.
+    /// Zero.
     Zero,
-    /// What is in the output.
+    /// The output's present content.
     Output,
-    /// The column's bias, at this pointer for the tile's first column.
+    /// The column's bias; the pointer is to that of the tile's first column.
     Bias(*const f32),
 }
 
-/// What becomes of a finished sum.
+/// Last operation on a finished sum.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum End {
-    /// Nothing.
+    /// None.
     Plain,
-    /// Zero if it is below zero.
+    /// max(0, sum).
     Rectified,
-    /// Zero where this matrix, laid out as the output and pointed at where the tile begins, is not above zero.
+    /// Zero where this matrix is not above zero. It is laid out as the output is; the pointer is to
+    /// the tile's first element.
     Gated(*const f32),
 }
 
-/// How a tile reads the left operand.
-pub(crate) trait LeftTile<T>: Copy {
-    /// Term `k` of the run that begins at `offset`, in this row.
+/// Rows of the left operand that a tile reads.
+pub(crate) trait LeftTile: Copy {
+    /// Returns the address of term `k` of the span that begins at `offset`, in this row.
     ///
     /// # Safety
     /// The term exists.
-    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const T;
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32;
 }
 
-/// Rows where they lie, each at a place of its own, terms of a run side by side.
+/// Rows read where they lie: any address for each, the terms of a span side by side.
 #[derive(Clone, Copy)]
-pub(crate) struct InPlace<T, const M: usize>(pub(crate) [*const T; M]);
+pub(crate) struct InPlace<const M: usize>(pub(crate) [*const f32; M]);
 
-impl<T: Copy, const M: usize> LeftTile<T> for InPlace<T, M> {
+impl<const M: usize> LeftTile for InPlace<M> {
     #[inline(always)]
-    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const T {
-        // SAFETY: as the caller says.
+    unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
+        // SAFETY: guaranteed by the caller.
         unsafe { self.0[row].add(offset + k) }
     }
 }
@@ -65,19 +68,19 @@ pub(crate) struct Packed {
     pub(crate) stride: usize,
 }
 
-impl LeftTile<f32> for Packed {
+impl LeftTile for Packed {
     #[inline(always)]
     unsafe fn term(self, row: usize, offset: usize, k: usize) -> *const f32 {
-        // SAFETY: as the caller says.
+        // SAFETY: guaranteed by the caller.
         unsafe { self.data.add((offset + k) * self.stride + row) }
     }
 }
 
-/// The place of a tile in the output.
+/// Position of a tile in the output.
 #[derive(Clone, Copy)]
 pub(crate) struct Output<const M: usize> {
     pub(crate) data: *mut f32,
-    /// Where each row begins.
+    /// Offset of each row.
     pub(crate) rows: [usize; M],
 }
 
@@ -90,22 +93,33 @@ impl<const M: usize> Output<M> {
     }
 }
 
-/// Full panels that a single row meets at once: eight sums under way hide that each term of one waits for the one before.
+/// Full panels that a single row is multiplied with at once. Each fused multiply-add waits for the
+/// one before in its sum; eight sums in flight hide that.
 pub(crate) const ROW_PANELS: usize = 4;
 
-/// The tallest tile of any instruction set, and its columns.
+/// Rows and columns of the largest tile of any instruction set.
 pub(crate) const MOST_ROWS: usize = 12;
 const MOST_COLUMNS: usize = 32;
 
-/// Calls a function that is generic over instruction set and height with the height that is only known now. No tile is made that the instruction set has no
-/// registers for: the guards are decided when the code is compiled.
+/// Calls a function that is generic over instruction set and height with a height known at run
+/// time.
+///
+/// The guards are constants, so no tile is compiled that the registers cannot hold. Tiles below the
+/// full height, which only the last rows need, are functions of their own: one function of all
+/// tiles takes the compiler three times as long.
 macro_rules! of_height {
     ($simd:ident, $rows:expr, $function:ident($($argument:expr),*)) => {
         of_height!(@ $simd, $rows, $function ($($argument),*) 1 2 3 4 5 6 7 8 9 10 11 12)
     };
     (@ $simd:ident, $rows:expr, $function:ident $arguments:tt $($height:literal)*) => {
         match $rows {
-            $($height if $height <= $simd::ROWS => of_height!(# $function, $simd, $height, $arguments),)*
+            $($height if $height == $simd::ROWS => {
+                of_height!(# $function, $simd, $height, $arguments)
+            })*
+            $($height if $height < $simd::ROWS => $simd::outlined(
+                #[inline(always)]
+                || of_height!(# $function, $simd, $height, $arguments),
+            ),)*
             _ => unreachable!("a tile has 1 to {} rows", $simd::ROWS),
         }
     };
@@ -115,60 +129,85 @@ macro_rules! of_height {
 }
 pub(crate) use of_height;
 
-/// A tile under `panel`, which may have fewer columns than it lays out.
+/// Computes a tile below `panel`, which may have fewer columns than its layout has room for.
 ///
 /// # Safety
-/// As for [`tile`], but that output, bias and gate need only have the columns that there are.
+/// As for [`tile`], but output, bias and gate need only have the columns that exist.
 #[inline(always)]
-pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
+pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile, const M: usize>(
     left: L,
-    runs: &[Run],
-    right: *const S::Term,
+    spans: &[Span],
+    right: *const f32,
     panel: Panel,
     begin: Begin,
     end: End,
     output: Output<M>,
 ) {
-    // SAFETY: as the caller says; where columns are missing, the tile works on memory of its own, which has them all.
+    // SAFETY: guaranteed by the caller. Where columns are missing, the tile works on a copy that
+    // has them all.
     unsafe {
-        if panel.columns == panel.width {
-            return if panel.width == S::LANES {
-                tile::<S, L, M, 1>(left, runs, right, panel.width, begin, end, output)
-            } else {
-                tile::<S, L, M, 2>(left, runs, right, panel.width, begin, end, output)
-            };
-        }
-        let mut whole = [0.0; MOST_ROWS * MOST_COLUMNS];
-        let aside = Output::<M>::even(whole.as_mut_ptr(), panel.width);
-        let row_of = |row: usize| output.data.add(output.rows[row]);
-        let begin = match begin {
-            Begin::Zero => Begin::Zero,
-            Begin::Output => {
-                for row in 0..M {
-                    aside.data.add(aside.rows[row]).copy_from(row_of(row), panel.columns);
-                }
-                Begin::Output
-            }
-            Begin::Bias(bias) => {
-                for row in 0..M {
-                    aside.data.add(aside.rows[row]).copy_from(bias, panel.columns);
-                }
-                Begin::Output
-            }
-        };
-        let (inner, gate) = match end {
-            End::Gated(by) => (End::Plain, Some(by)),
-            end => (end, None),
-        };
-        if panel.width == S::LANES {
-            tile::<S, L, M, 1>(left, runs, right, panel.width, begin, inner, aside);
+        let mut whole;
+        let is_whole = panel.columns == panel.width;
+        let (tile_begin, tile_end, tile_output) = if is_whole {
+            (begin, end, output)
         } else {
-            tile::<S, L, M, 2>(left, runs, right, panel.width, begin, inner, aside);
+            whole = [0.0; MOST_ROWS * MOST_COLUMNS];
+            let aside = Output::<M>::even(whole.as_mut_ptr(), panel.width);
+            let begin = copy_in(begin, panel.columns, output, aside);
+            let end = match end {
+                End::Gated(_) => End::Plain,
+                end => end,
+            };
+            (begin, end, aside)
+        };
+        let width = panel.width;
+        if width == S::LANES {
+            tile::<S, L, M, 1>(left, spans, right, width, tile_begin, tile_end, tile_output);
+        } else {
+            tile::<S, L, M, 2>(left, spans, right, width, tile_begin, tile_end, tile_output);
         }
-        for row in 0..M {
-            for column in 0..panel.columns {
-                let open = gate.is_none_or(|by| *by.add(output.rows[row] + column) > 0.0);
-                *row_of(row).add(column) = if open {
+        if !is_whole {
+            copy_out(tile_output, panel.columns, end, output);
+        }
+    }
+}
+
+/// Copies a tile's initial values to memory that has all columns, and returns how the tile begins
+/// there.
+#[inline(always)]
+unsafe fn copy_in<const M: usize>(
+    begin: Begin,
+    columns: usize,
+    output: Output<M>,
+    aside: Output<M>,
+) -> Begin {
+    for row in 0..M {
+        // SAFETY: guaranteed by the caller of `panel_tile`.
+        unsafe {
+            let from = match begin {
+                Begin::Zero => return Begin::Zero,
+                Begin::Output => output.data.add(output.rows[row]).cast_const(),
+                Begin::Bias(bias) => bias,
+            };
+            aside.data.add(aside.rows[row]).copy_from(from, columns);
+        }
+    }
+    Begin::Output
+}
+
+/// Copies a finished tile's columns to the output, through its gate if it has one.
+#[inline(always)]
+unsafe fn copy_out<const M: usize>(aside: Output<M>, columns: usize, end: End, output: Output<M>) {
+    for row in 0..M {
+        for column in 0..columns {
+            let at = output.rows[row] + column;
+            // SAFETY: guaranteed by the caller of `panel_tile`.
+            unsafe {
+                let open = match end {
+                    End::Gated(by) => *by.add(at) > 0.0,
+                    End::Plain | End::Rectified => true,
+                };
+                *output.data.add(at) = if open {
                     *aside.data.add(aside.rows[row] + column)
                 } else {
                     0.0
@@ -178,22 +217,23 @@ pub(crate) unsafe fn panel_tile<S: Simd, L: LeftTile<S::Term>, const M: usize>(
     }
 }
 
-/// A tile of `M` rows and `N` registers: output = end(begin + left · panel).
+/// Computes a tile of `M` rows and `N` registers: output = end(begin + left · panel).
 ///
 /// # Safety
-/// `S`'s instructions are there. The left tile has `M` rows with all terms of `runs`; `panel` has as many rows of `panel_width` numbers as the runs have terms;
-/// `output`, a bias and a gate have `M` rows (a bias one) of `N · LANES` numbers. Nothing else touches the output meanwhile.
+/// The processor has the instructions of `S`. The left tile has `M` rows with all terms of `spans`;
+/// `panel` has as many rows of `panel_width` numbers as the spans have terms. Output and gate have
+/// `M` rows of `N · LANES` numbers, a bias has one. Nothing else accesses the output meanwhile.
 #[inline(always)]
-pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N: usize>(
+unsafe fn tile<S: Simd, L: LeftTile, const M: usize, const N: usize>(
     left: L,
-    runs: &[Run],
-    panel: *const S::Term,
+    spans: &[Span],
+    panel: *const f32,
     panel_width: usize,
     begin: Begin,
     end: End,
     output: Output<M>,
 ) {
-    // SAFETY: all pointers are offset within what the caller vouches for.
+    // SAFETY: all addresses are within what the caller guarantees.
     unsafe {
         fetch_ahead::<S, M, N>(end, output);
         let mut sums = [[S::zero(); N]; M];
@@ -215,14 +255,14 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
             }
         }
         let mut right = panel;
-        for run in runs {
-            for k in 0..run.len {
+        for span in spans {
+            for k in 0..span.len {
                 let mut parts = [S::zero(); N];
                 for (part, value) in parts.iter_mut().enumerate() {
-                    *value = S::load_terms(right.add(part * S::LANES));
+                    *value = S::load(right.add(part * S::LANES));
                 }
                 for (row, sums) in sums.iter_mut().enumerate() {
-                    let term = S::splat(*left.term(row, run.offset, k));
+                    let term = S::splat(*left.term(row, span.offset, k));
                     for (sum, part) in sums.iter_mut().zip(parts) {
                         *sum = S::fused(term, part, *sum);
                     }
@@ -253,13 +293,15 @@ pub(crate) unsafe fn tile<S: Simd, L: LeftTile<S::Term>, const M: usize, const N
     }
 }
 
-/// Asks for the memory that a tile ends at, when it begins: it has often left the nearer caches, and would be waited for when the sums are done.
+/// Prefetches the memory that the finished tile needs. It has often left the nearer caches, and the
+/// processor would wait for it at the end.
 #[inline(always)]
 unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output: Output<M>) {
     let places = |from: *const f32| {
-        (0..M * N).map(move |place| from.wrapping_add(output.rows[place / N] + place % N * S::LANES))
+        (0..M * N)
+            .map(move |place| from.wrapping_add(output.rows[place / N] + place % N * S::LANES))
     };
-    // SAFETY: any address may be asked for.
+    // SAFETY: a prefetch accepts any address.
     unsafe {
         places(output.data).for_each(
             #[inline(always)]
@@ -274,9 +316,10 @@ unsafe fn fetch_ahead<S: Simd, const M: usize, const N: usize>(end: End, output:
     }
 }
 
-/// Stores finished sums, each as `finish` makes it of the sum and its place.
+/// Stores finished sums. `finish` receives a sum and its offset, and returns the number to store.
 ///
-/// One short loop for each way to finish: in a long one, which the compiler does not unroll, the sums would be indexed, and so live in memory from the first term on.
+/// Each way to finish has a short loop of its own: a long loop is not unrolled, and sums that it
+/// indexes would live in memory from the first term on.
 #[inline(always)]
 unsafe fn put<S: Simd, const M: usize, const N: usize>(
     sums: [[S::Vector; N]; M],
@@ -292,20 +335,20 @@ unsafe fn put<S: Simd, const M: usize, const N: usize>(
     }
 }
 
-/// One row under [`ROW_PANELS`] full panels, `output` as wide as all of them.
+/// Computes one row below [`ROW_PANELS`] full panels; `output` is as wide as all of them.
 ///
 /// # Safety
 /// As for [`tile`].
 #[inline(always)]
 pub(crate) unsafe fn row_of_panels<S: Simd>(
-    left: *const S::Term,
-    runs: &[Run],
-    panels: [*const S::Term; ROW_PANELS],
+    left: *const f32,
+    spans: &[Span],
+    panels: [*const f32; ROW_PANELS],
     begin: Begin,
     end: End,
     output: *mut f32,
 ) {
-    // SAFETY: all pointers are offset within what the caller vouches for.
+    // SAFETY: all addresses are within what the caller guarantees.
     unsafe {
         let mut sums = [[S::zero(); 2]; ROW_PANELS];
         let at = |panel: usize, part: usize| (2 * panel + part) * S::LANES;
@@ -319,12 +362,13 @@ pub(crate) unsafe fn row_of_panels<S: Simd>(
             }
         }
         let mut passed = 0;
-        for run in runs {
-            for k in 0..run.len {
-                let term = S::splat(*left.add(run.offset + k));
+        for span in spans {
+            for k in 0..span.len {
+                let term = S::splat(*left.add(span.offset + k));
                 for (panel, sums) in panels.iter().zip(&mut sums) {
                     for (part, sum) in sums.iter_mut().enumerate() {
-                        *sum = S::fused(term, S::load_terms(panel.add(passed + part * S::LANES)), *sum);
+                        let right = S::load(panel.add(passed + part * S::LANES));
+                        *sum = S::fused(term, right, *sum);
                     }
                 }
                 passed += 2 * S::LANES;

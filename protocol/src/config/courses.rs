@@ -1,21 +1,27 @@
-//! `[courses]`.
+//! The `[courses]` section.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::file::read_text;
+use super::{InvalidValue, require};
 
-/// `[courses]`: what is flown through. Paths are relative to the configuration file; given with `--set`, to the working directory. Courses that are not named are those that come with
-/// Skein, in `configs/courses/`.
+/// The `[courses]` section: the courses of training and evaluation.
+///
+/// Paths are relative to the configuration file; with `--set`, to the working directory. Keys left
+/// out name the courses that come with Skein, in `configs/courses/`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoursesSection {
-    /// The course training flies.
+    /// Course file of the training episodes. Default `courses/training.toml`.
     pub training: PathBuf,
-    /// Share of training flights flown on a generated course instead, a new one each, in [0, 1]. Default 0: the training course only, as in the paper.
+    /// Share of training episodes that fly a generated course instead, a new one each, in [0, 1].
+    /// Default 0: the training course only, as in the paper.
     pub generated_share: f64,
-    /// The courses of the final evaluation, in the order of its table. The first is the one snapshots are confirmed on.
+    /// Course files of the final evaluation, in the order of its table; 1 to 64. Candidates for the
+    /// best snapshot are confirmed on the first. Default: `training.toml`, `rearranged_34125.toml`,
+    /// `rearranged_53412.toml` and `non_rectangular.toml`.
     pub evaluation: Vec<PathBuf>,
 }
 
@@ -38,27 +44,62 @@ impl Default for CoursesSection {
 }
 
 impl CoursesSection {
-    /// What a course is called in reports: its file's name without the ending.
-    pub fn name_of(course: &Path) -> String {
-        course.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    /// Returns the file name of a course without the extension.
+    pub fn stem_of(course: &Path) -> String {
+        course
+            .file_stem()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
     }
 
-    /// Every course file.
+    /// Returns the names of `courses` in reports: the key `name` of each file. Equal names get the
+    /// file's stem in brackets. A file without a name, or that cannot be read, is named by its
+    /// stem.
+    pub fn names<P: AsRef<Path>>(courses: &[P]) -> Vec<String> {
+        let own: Vec<_> = courses
+            .iter()
+            .map(|course| {
+                let stem = Self::stem_of(course.as_ref());
+                (
+                    name_in(course.as_ref()).unwrap_or_else(|| stem.clone()),
+                    stem,
+                )
+            })
+            .collect();
+        let mut names: Vec<String> = Vec::with_capacity(own.len());
+        for (name, stem) in &own {
+            let is_shared = own.iter().filter(|(other, _)| other == name).count() > 1;
+            let base = match is_shared {
+                true => format!("{name} ({stem})"),
+                false => name.clone(),
+            };
+            let mut numbered = (2..).map(|number| format!("{base} {number}"));
+            let mut unused = base.clone();
+            while names.contains(&unused) {
+                unused = numbered.next().expect("there is always a next number");
+            }
+            names.push(unused);
+        }
+        names
+    }
+
+    /// Returns every course file.
     pub fn paths(&self) -> impl Iterator<Item = &PathBuf> {
         std::iter::once(&self.training).chain(&self.evaluation)
     }
 
-    /// Every course file, to be changed.
+    /// Returns every course file, mutable.
     pub fn paths_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
         self.evaluation.iter_mut().chain([&mut self.training])
     }
 
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
             (0.0..=1.0).contains(&self.generated_share),
             "courses.generated_share",
             self.generated_share,
-            "is outside [0, 1]: it is a share of the training flights",
+            "is outside [0, 1]: it is a share of the training episodes",
         )?;
         require(
             !self.evaluation.is_empty(),
@@ -72,5 +113,47 @@ impl CoursesSection {
             self.evaluation.len(),
             "lists more than 64 courses: tickets could not number them",
         )
+    }
+}
+
+/// Returns the key `name` of the course file at `path`, unless it is blank.
+fn name_in(path: &Path) -> Option<String> {
+    let course: toml::Table = toml::from_str(&read_text(path).ok()?).ok()?;
+    let name = course.get("name")?.as_str()?.trim();
+    (!name.is_empty()).then(|| name.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_course_is_shown_by_its_name_and_equal_names_are_told_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |file: &str, text: &str| {
+            let path = folder.path().join(file);
+            std::fs::write(&path, text).unwrap();
+            path
+        };
+        let courses = [
+            write("gates.toml", "name = \"two gates\""),
+            write("hall.toml", "name = \"hall\""),
+            write("hall_2.toml", "name = \" hall \""),
+            write("blank.toml", "name = \"\""),
+            folder.path().join("missing.toml"),
+        ];
+        let names = CoursesSection::names(&courses);
+        assert_eq!(
+            names,
+            [
+                "two gates",
+                "hall (hall)",
+                "hall (hall_2)",
+                "blank",
+                "missing"
+            ]
+        );
+        let twice = CoursesSection::names(&[&courses[0], &courses[0]]);
+        assert_eq!(twice, ["two gates (gates)", "two gates (gates) 2"]);
     }
 }

@@ -1,4 +1,4 @@
-//! Reading a configuration file, with overrides, and writing it back.
+//! Reads a configuration file with overrides, and writes it back.
 
 use std::fs;
 use std::io;
@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-use super::{Config, DEEPEST, Invalid};
+use super::{Config, InvalidValue, MAX_NESTING};
 
-/// Why a configuration cannot be used. Every variant names the file or the override it came from.
+/// Reason why a configuration cannot be used. Every variant names the file or the override.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
@@ -16,7 +16,7 @@ pub enum ConfigError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         #[source]
         source: io::Error,
     },
@@ -25,7 +25,7 @@ pub enum ConfigError {
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where and why.
+        /// Position and cause.
         #[source]
         source: Box<toml::de::Error>,
     },
@@ -34,42 +34,47 @@ pub enum ConfigError {
     Key {
         /// The file.
         path: PathBuf,
-        /// Which key, and what was expected.
+        /// The key, and what was expected.
         message: String,
     },
-    /// A value makes no sense.
+    /// A value is out of bounds, or contradicts another key.
     #[error("{}: {source}", path.display())]
     Invalid {
         /// The file.
         path: PathBuf,
-        /// Which key, and why.
+        /// The key, the value and the bound.
         #[source]
-        source: Invalid,
+        source: InvalidValue,
     },
-    /// An override cannot be understood.
+    /// An override cannot be parsed.
     #[error("--set {text}: {problem}; write it as section.key=value")]
     Override {
         /// The override as given.
         text: String,
-        /// What is wrong with it.
+        /// The problem.
         problem: String,
     },
-    /// The file could be used, were it not for an override.
+    /// The file is valid without an override.
     #[error("with --set {text}, {source}")]
     Overridden {
         /// The override as given.
         text: String,
-        /// What is wrong now.
+        /// The error with the override.
         #[source]
         source: Box<ConfigError>,
     },
 }
 
-/// The override that brought about the failure of `attempt` with all of `overrides`: since it, and not before, the attempt fails with these very words.
-/// `None` when the file alone fails so.
+/// Returns the override that causes the failure of `attempt` with all of `overrides`: the first
+/// that makes the attempt fail with exactly this message. Returns `None` when the file alone fails
+/// this way.
 ///
-/// `attempt` is given the first so many overrides, and returns what the user would be told; `None` when it succeeds.
-pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<String>) -> Option<&String> {
+/// `attempt` receives the first overrides, from none to all; it returns the error message, or
+/// `None` when it succeeds.
+pub fn failing_override(
+    overrides: &[String],
+    attempt: impl Fn(&[String]) -> Option<String>,
+) -> Option<&String> {
     let failure = attempt(overrides);
     (0..overrides.len())
         .rev()
@@ -77,23 +82,29 @@ pub fn culprit(overrides: &[String], attempt: impl Fn(&[String]) -> Option<Strin
         .map(|count| &overrides[count])
 }
 
-/// Names the folder of the configurations that come with Skein, whose `courses/` holds the default courses; the scripts in `launch/` set it. Without it they are looked for beside the
-/// configuration file.
+/// Environment variable that names the folder of the shipped configurations, whose `courses/` holds
+/// the default courses. The scripts in `launch/` set it. Without it, the folder of the
+/// configuration file is used.
 const SHIPPED_CONFIGS: &str = "SKEIN_CONFIGS";
 
 impl Config {
-    /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a bare word) and validates the result. Course paths
-    /// become relative to the working directory: in the file they are relative to the file, in an override to the working directory.
+    /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a
+    /// bare word) and validates the result. Course paths in the file are relative to the file,
+    /// those in an override to the working directory.
     ///
     /// # Errors
-    /// [`ConfigError`] names file, key, value and remedy, and the override that is to blame.
+    /// [`ConfigError`] names file, key, value and remedy, and the override that caused it.
     pub fn load(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let error = match Self::resolve(path, overrides) {
             Err(error) if !matches!(error, ConfigError::Override { .. }) => error,
-            settled => return settled,
+            other => return other,
         };
-        let told = |overrides: &[String]| Self::resolve(path, overrides).err().map(|error| error.to_string());
-        Err(match culprit(overrides, told) {
+        let message = |overrides: &[String]| {
+            Self::resolve(path, overrides)
+                .err()
+                .map(|error| error.to_string())
+        };
+        Err(match failing_override(overrides, message) {
             Some(text) => ConfigError::Overridden {
                 text: text.clone(),
                 source: Box::new(error),
@@ -110,7 +121,8 @@ impl Config {
         Self::parse(&text, path, overrides)
     }
 
-    /// Reads a configuration from the `text` of a configuration file at `path`, as [`Config::load`] does, but for telling which override is to blame.
+    /// Reads a configuration from the `text` of a configuration file at `path`. Unlike
+    /// [`Config::load`], an error does not name the override that caused it.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
@@ -119,16 +131,24 @@ impl Config {
         Self::parse_with(text, path, overrides, shipped.as_deref())
     }
 
-    /// [`Config::parse`], with the courses that are not named in `shipped`, or beside the file.
-    fn parse_with(text: &str, path: &Path, overrides: &[String], shipped: Option<&Path>) -> Result<Self, ConfigError> {
-        let mut table: Table = toml::from_str(text).map_err(|source| ConfigError::Syntax {
-            path: path.to_owned(),
-            source: Box::new(source),
-        })?;
+    /// Reads as [`Config::parse`] does. Courses that the file does not name lie in `shipped`, or
+    /// beside the file.
+    fn parse_with(
+        text: &str,
+        path: &Path,
+        overrides: &[String],
+        shipped: Option<&Path>,
+    ) -> Result<Self, ConfigError> {
+        let mut table: Table =
+            toml::from_str(text).map_err(|error| syntax_error(path, text, error))?;
         for text in overrides {
             apply_override(&mut table, text)?;
         }
-        let named = |key: &str| table.get("courses").is_some_and(|courses| courses.get(key).is_some());
+        let named = |key: &str| {
+            table
+                .get("courses")
+                .is_some_and(|courses| courses.get(key).is_some())
+        };
         let named = [named("training"), named("evaluation")];
         let mut config = from_table(table).map_err(|message| ConfigError::Key {
             path: path.to_owned(),
@@ -148,7 +168,8 @@ impl Config {
         for course in config.courses.paths() {
             if course.to_str().is_none() {
                 let message = format!(
-                    "[courses] {} is not UTF-8, so it could not be written into the files of a run; rename the folder",
+                    "[courses] {} is not UTF-8 and cannot be stored in the files of a run; \
+                    rename the folder",
                     course.display()
                 );
                 return Err(ConfigError::Key {
@@ -160,19 +181,60 @@ impl Config {
         Ok(config)
     }
 
-    /// The whole configuration as TOML, defaults included.
+    /// Returns this configuration, read from `path`, with `overrides` as in [`Config::load`].
+    /// Course paths stay as they are.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names file, key, value and remedy.
+    pub fn overridden(&self, path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let changed = Self::parse_with(&self.to_toml(), path, overrides, None)?;
+        Ok(Self {
+            courses: self.courses.clone(),
+            ..changed
+        })
+    }
+
+    /// Returns the whole configuration as TOML, defaults included.
     pub fn to_toml(&self) -> String {
-        toml::to_string_pretty(self).expect("every field of the configuration is representable in TOML")
+        toml::to_string_pretty(self)
+            .expect("every field of the configuration is representable in TOML")
     }
 }
 
-/// Deserializes section by section, so that an error names its section: the parser itself only knows the key.
+/// Converts the parser's error; of an integer that is too large it knows only the type.
+fn syntax_error(path: &Path, text: &str, error: toml::de::Error) -> ConfigError {
+    let place = error.span().unwrap_or_default();
+    let path = path.to_owned();
+    match text.get(place.clone()).filter(|value| is_integer(value)) {
+        Some(value) => ConfigError::Key {
+            path,
+            message: format!(
+                "line {}: {value} {INTEGER_TOO_LARGE}",
+                1 + text[..place.start].matches('\n').count()
+            ),
+        },
+        None => ConfigError::Syntax {
+            path,
+            source: Box::new(error),
+        },
+    }
+}
+
+/// Deserializes section by section, so that an error names its section: the parser itself knows
+/// only the key.
 fn from_table(mut table: Table) -> Result<Config, String> {
     let mut config = Config::default();
-    fn section<T: serde::de::DeserializeOwned>(table: &mut Table, name: &str, into: &mut T) -> Result<(), String> {
+    fn section<T: serde::de::DeserializeOwned>(
+        table: &mut Table,
+        name: &str,
+        into: &mut T,
+    ) -> Result<(), String> {
         if let Some(value) = table.remove(name) {
             *into = value.try_into().map_err(|error: toml::de::Error| {
-                format!("[{name}] {}", error.to_string().trim_end().replace('\n', " "))
+                format!(
+                    "[{name}] {}",
+                    error.to_string().trim_end().replace('\n', " ")
+                )
             })?;
         }
         Ok(())
@@ -191,7 +253,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     match table.keys().next() {
         None => Ok(config),
         Some(unknown) => Err(format!(
-            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, replay, evaluation, checkpoints, transport, simulator"
+            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, \
+            replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }
@@ -202,9 +265,12 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
         problem: problem.to_owned(),
     };
     let (path, value) = text.split_once('=').ok_or_else(|| fail("has no `=`"))?;
-    let (sections, key) = path.trim().rsplit_once('.').ok_or_else(|| fail("names no section"))?;
-    if sections.split('.').count() > DEEPEST {
-        return Err(fail("names sections deeper within each other than any section lies"));
+    let (sections, key) = path
+        .trim()
+        .rsplit_once('.')
+        .ok_or_else(|| fail("names no section"))?;
+    if sections.split('.').count() > MAX_NESTING {
+        return Err(fail("nests sections deeper than any section lies"));
     }
     let mut target = table;
     for section in sections.split('.') {
@@ -214,15 +280,17 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
             .as_table_mut()
             .ok_or_else(|| fail("names a value where a section is expected"))?;
     }
-    let mut value = parse_value(value.trim());
+    let mut value = parse_value(value.trim()).map_err(fail)?;
     if matches!((sections, key), ("courses", "training" | "evaluation")) {
-        make_absolute(&mut value).map_err(|error| fail(&format!("no path can be made of it ({error})")))?;
+        make_absolute(&mut value)
+            .map_err(|error| fail(&format!("is not a usable path ({error})")))?;
     }
     target.insert(key.to_owned(), value);
     Ok(())
 }
 
-/// Paths on the command line are the user's, who knows nothing of the configuration file's folder. What is no path is left for validation to refuse.
+/// Makes course paths absolute: paths on the command line are relative to the working directory,
+/// not to the configuration file. Other values are left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {
@@ -234,21 +302,58 @@ fn make_absolute(value: &mut Value) -> io::Result<()> {
     }
 }
 
-/// A value in TOML's notation, or else the text itself: `--set run.device=cpu` needs no quotes.
-fn parse_value(text: &str) -> Value {
-    toml::from_str::<Table>(&format!("value = {text}"))
-        .ok()
-        .and_then(|mut table| table.remove("value"))
-        .unwrap_or_else(|| Value::String(text.to_owned()))
+/// Parses a value in TOML's notation, or else takes the text itself: `--set run.device=cpu` needs
+/// no quotes.
+///
+/// # Errors
+/// The problem, if a part of the text would be ignored or the number does not fit.
+fn parse_value(text: &str) -> Result<Value, &'static str> {
+    let Ok(mut table) = toml::from_str::<Table>(&format!("value = {text}")) else {
+        return if text.contains(['\n', '\r']) {
+            Err("holds a line break: give each setting a --set with one value")
+        } else if is_integer(text) {
+            Err(INTEGER_TOO_LARGE)
+        } else {
+            Ok(Value::String(text.to_owned()))
+        };
+    };
+    // A further key on the next line and a comment are TOML, but no part of the value. In brackets,
+    // neither is possible.
+    let bracketed = toml::from_str::<Table>(&format!("value = [{text}]"));
+    let is_one_value = bracketed.is_ok_and(
+        |table| matches!(table.get("value"), Some(Value::Array(values)) if values.len() == 1),
+    );
+    match table.remove("value") {
+        Some(value) if is_one_value && table.is_empty() => Ok(value),
+        _ => Err(
+            "holds more than one value, and the rest would be ignored: give each setting a \
+            --set with one value",
+        ),
+    }
 }
 
-/// Reads a text file of a size that people write. Of what is no file, a pipe or a device, the end might never come.
-fn read_text(path: &Path) -> io::Result<String> {
-    /// Many times what a configuration with every key and a comment on each has.
-    const LONGEST: u64 = 1 << 20;
+/// Problem of an integer that TOML does not hold.
+const INTEGER_TOO_LARGE: &str = "is an integer outside -9223372036854775808 to \
+    9223372036854775807 (64 bits with a sign), which TOML does not hold: choose one within";
+
+/// `true` for the digits of a decimal integer, with or without a sign.
+fn is_integer(text: &str) -> bool {
+    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
+    digits.starts_with(|first: char| first.is_ascii_digit())
+        && digits
+            .chars()
+            .all(|digit| digit.is_ascii_digit() || digit == '_')
+}
+
+/// Reads a text file of ordinary size. Reading a pipe or a device might never end.
+pub(super) fn read_text(path: &Path) -> io::Result<String> {
+    /// Many times the size of a configuration with every key and a comment on each.
+    const MAX_BYTES: u64 = 1 << 20;
     let about = fs::metadata(path)?;
-    if !about.is_file() || about.len() > LONGEST {
-        return Err(io::Error::other(format!("is no text file of at most {LONGEST} bytes")));
+    if !about.is_file() || about.len() > MAX_BYTES {
+        return Err(io::Error::other(format!(
+            "it is not a text file of at most {MAX_BYTES} bytes"
+        )));
     }
     fs::read_to_string(path)
 }
@@ -284,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn every_device_has_its_engine_unless_another_is_asked_for() {
+    fn each_device_has_a_default_engine_that_a_key_overrides() {
         let engine = |overrides: &[&str]| load("", overrides).unwrap().run.engine();
         assert_eq!(engine(&[]), Engine::Native);
         assert_eq!(engine(&["run.device=cuda:1"]), Engine::Libtorch);
@@ -292,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_for_libtorch_alone_is_computed_by_it_and_nothing_else_is() {
+    fn only_parts_without_native_kernels_are_computed_by_libtorch() {
         let engines = |overrides: &[&str]| {
             let config = load("", overrides).unwrap();
             (config.policy_engine(), config.vae.engine(&config.run))
@@ -300,9 +405,13 @@ mod tests {
         let (native, libtorch) = (Engine::Native, Engine::Libtorch);
         assert_eq!(engines(&[]), (native, native));
         assert_eq!(engines(&["vae.decoder=u-net"]), (native, libtorch));
+        assert_eq!(engines(&["learning.algorithm=td3"]), (libtorch, native));
         for algorithm in ["sac", "td3"] {
             let algorithm = format!("learning.algorithm={algorithm}");
-            assert_eq!(engines(&["learning.encoder=end-to-end", &algorithm]).0, libtorch);
+            assert_eq!(
+                engines(&["learning.encoder=end-to-end", &algorithm]).0,
+                libtorch
+            );
             assert_eq!(engines(&["run.engine=libtorch", &algorithm]).0, libtorch);
         }
     }
@@ -310,7 +419,9 @@ mod tests {
     #[test]
     fn course_paths_are_relative_to_the_file() {
         let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
-        assert!(config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml"));
+        assert!(
+            config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml")
+        );
     }
 
     #[test]
@@ -327,10 +438,16 @@ mod tests {
         );
         let courses = parse("[courses]\ntraining = \"a.toml\"").courses;
         assert_eq!(courses.training, Path::new("/mine/a.toml"));
-        assert_eq!(courses.evaluation[0], Path::new("/skein/configs/courses/training.toml"));
+        assert_eq!(
+            courses.evaluation[0],
+            Path::new("/skein/configs/courses/training.toml")
+        );
         let courses = parse("[courses]\nevaluation = [\"b.toml\"]").courses;
         assert_eq!(courses.evaluation, [Path::new("/mine/b.toml")]);
-        assert_eq!(courses.training, Path::new("/skein/configs/courses/training.toml"));
+        assert_eq!(
+            courses.training,
+            Path::new("/skein/configs/courses/training.toml")
+        );
     }
 
     #[test]
@@ -345,21 +462,29 @@ mod tests {
         )
         .unwrap();
         assert_eq!(config.courses.training, here.join("a/b.toml"));
-        assert_eq!(config.courses.evaluation, [here.join("c.toml"), "/d.toml".into()]);
+        assert_eq!(
+            config.courses.evaluation,
+            [here.join("c.toml"), "/d.toml".into()]
+        );
         let error = load("", &["courses.training="]).unwrap_err();
         assert!(error.contains("--set courses.training="), "{error}");
     }
 
     #[test]
-    fn a_folder_whose_name_cannot_be_written_down_is_refused() {
+    fn a_folder_name_that_is_not_utf8_is_refused() {
         use std::os::unix::ffi::OsStrExt;
         let path = Path::new(std::ffi::OsStr::from_bytes(b"/runs/\xff/config.toml"));
-        let error = Config::parse_with("", path, &[], None).unwrap_err().to_string();
-        assert!(error.contains("is not UTF-8") && error.contains("rename"), "{error}");
+        let error = Config::parse_with("", path, &[], None)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("is not UTF-8") && error.contains("rename"),
+            "{error}"
+        );
     }
 
     #[test]
-    fn the_override_that_is_to_blame_is_named_and_no_other() {
+    fn the_override_that_causes_an_error_is_named_and_no_other() {
         for (text, overrides, blamed) in [
             (
                 "",
@@ -383,7 +508,10 @@ mod tests {
         ] {
             let error = load(text, &overrides).unwrap_err();
             match blamed {
-                Some(blamed) => assert!(error.starts_with(&format!("with --set {blamed}, ")), "{error}"),
+                Some(blamed) => assert!(
+                    error.starts_with(&format!("with --set {blamed}, ")),
+                    "{error}"
+                ),
                 None => assert!(!error.contains("--set"), "{error}"),
             }
             assert!(error.contains("test.toml"), "{error}");
@@ -394,12 +522,81 @@ mod tests {
     fn overrides_take_toml_and_bare_words() {
         let config = load(
             "",
-            &["run.seed=7", "run.device=cuda:1", "simulator.vehicle.preset=point"],
+            &[
+                "run.seed=7",
+                "run.device=cuda:1",
+                "simulator.vehicle.preset=point",
+            ],
         )
         .unwrap();
         assert_eq!(config.run.seed, 7);
         assert_eq!(config.run.device, Device::Cuda(1));
-        assert_eq!(config.simulator["vehicle"]["preset"].as_str(), Some("point"));
+        assert_eq!(
+            config.simulator["vehicle"]["preset"].as_str(),
+            Some("point")
+        );
+    }
+
+    #[test]
+    fn an_override_is_used_whole_or_refused() {
+        let refused = |text: &str, parts: &[&str]| {
+            let error = load("", &[text]).unwrap_err();
+            assert!(error.contains("--set "), "{error}");
+            for part in parts {
+                assert!(error.contains(part), "`{error}` does not mention `{part}`");
+            }
+        };
+        for text in [
+            "run.seed=7\n[sac]",
+            "run.seed=7\nepisodes=3",
+            "run.seed=7 # the best",
+            "run.seed=7#8",
+            "learning.history_steps=[2] # [4]",
+        ] {
+            refused(text, &["more than one value", "would be ignored"]);
+        }
+        refused("run.device=cpu\nrun.seed=3", &["a line break"]);
+        refused("run.seed=7\nvalue=3", &["a line break"]);
+        let lines = "learning.history_steps=[\n  2, # half a second\n  4,\n]";
+        assert_eq!(load("", &[lines]).unwrap().learning.history_steps, [2, 4]);
+        let path = load("", &["courses.training=a#b.toml"])
+            .unwrap()
+            .courses
+            .training;
+        assert!(path.ends_with("a#b.toml"), "{}", path.display());
+    }
+
+    #[test]
+    fn an_integer_that_toml_does_not_hold_is_named_as_such() {
+        for seed in [
+            "9223372036854775808",
+            "18446744073709551616",
+            "-9223372036854775809",
+        ] {
+            let set = load("", &[&format!("run.seed={seed}")]).unwrap_err();
+            assert!(
+                set.contains(&format!("--set run.seed={seed}: is an integer")),
+                "{set}"
+            );
+            let file = load(&format!("[run]\nepisodes = 9\nseed = {seed} # x"), &[]).unwrap_err();
+            assert!(
+                file.contains(&format!("test.toml: line 3: {seed} is an integer outside")),
+                "{file}"
+            );
+        }
+        let largest = load("", &["run.seed=9223372036854775807"]).unwrap();
+        assert_eq!(largest.run.seed, i64::MAX as u64);
+    }
+
+    #[test]
+    fn a_configuration_with_overrides_keeps_its_courses() {
+        let here = Config::default();
+        let there = Path::new("best.safetensors");
+        let other = here
+            .overridden(there, &["simulator.max_steps=200".to_owned()])
+            .unwrap();
+        assert_eq!(other.courses, here.courses);
+        assert_eq!(other.simulator["max_steps"].as_integer(), Some(200));
     }
 
     #[test]
@@ -410,9 +607,21 @@ mod tests {
                 vec![],
                 vec!["test.toml", "[run]", "unknown field `sed`", "seed"],
             ),
-            ("[rum]", vec![], vec!["test.toml", "unknown section [rum]", "run"]),
-            ("[run]\nseed = \"x\"", vec![], vec!["test.toml", "[run]", "seed"]),
-            ("", vec!["seed=1"], vec!["--set seed=1", "section.key=value"]),
+            (
+                "[rum]",
+                vec![],
+                vec!["test.toml", "unknown section [rum]", "run"],
+            ),
+            (
+                "[run]\nseed = \"x\"",
+                vec![],
+                vec!["test.toml", "[run]", "seed"],
+            ),
+            (
+                "",
+                vec!["seed=1"],
+                vec!["--set seed=1", "section.key=value"],
+            ),
             ("", vec!["run.seed"], vec!["--set run.seed", "no `=`"]),
             (
                 "[learning]\nwarmup_steps = 200000",
@@ -420,52 +629,74 @@ mod tests {
                 vec!["learning.warmup_steps = 200000", "replay.capacity"],
             ),
             ("[run]\ndevice = \"gpu\"", vec![], vec!["gpu", "cuda:N"]),
-            ("[run]\nengine = \"jax\"", vec![], vec!["jax", "native", "libtorch"]),
+            (
+                "[run]\nengine = \"jax\"",
+                vec![],
+                vec!["jax", "native", "libtorch"],
+            ),
             (
                 "[run]\nengine = \"native\"",
                 vec!["run.device=cuda:1"],
-                vec!["run.engine = native", "run.device = cuda:1", "leave run.engine out"],
+                vec![
+                    "run.engine = native",
+                    "run.device = cuda:1",
+                    "leave run.engine out",
+                ],
             ),
             ("[sac]\ndiscount = nan", vec![], vec!["sac.discount = NaN"]),
             (
-                "[learning]\nleg_steps = 1",
+                "[learning]\nsegment_steps = 1",
                 vec![],
-                vec!["learning.flights_per_epoch = 10", "leg_steps = 1", "set it to 1"],
+                vec![
+                    "learning.episodes_per_epoch = 10",
+                    "segment_steps = 1",
+                    "set it to 1",
+                ],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1",
                 vec!["learning.policy_lag=1"],
                 vec![
                     "--set learning.policy_lag=1",
                     "learning.policy_lag = 1",
-                    "leg_steps = 1",
+                    "segment_steps = 1",
                     "set it to 0",
                 ],
             ),
             (
-                "[learning]\nleg_steps = 2\nflights_per_epoch = 1\n[replay]\nsuccess = \"approach\"",
+                "[learning]\nsegment_steps = 2\nepisodes_per_epoch = 1\n\
+                [replay]\nsuccess = \"approach\"",
                 vec![],
-                vec!["replay.success = approach", "leg_steps = 2", "level-up"],
+                vec!["replay.success = approach", "segment_steps = 2", "level-up"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\n[transport]\nmax_records_per_flight = 300",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\n\
+                [transport]\nmax_records_per_episode = 300",
                 vec![],
-                vec!["transport.max_records_per_flight = 300", "256", "lower it"],
+                vec!["transport.max_records_per_episode = 300", "256", "lower it"],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nhistory_steps = [2]",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nhistory_steps = [2]",
                 vec![],
-                vec!["learning.history_steps = [2]", "leg_steps = 1", "name none"],
+                vec![
+                    "learning.history_steps = [2]",
+                    "segment_steps = 1",
+                    "set it to []",
+                ],
             ),
             (
-                "[learning]\nleg_steps = 1\nflights_per_epoch = 1\nmirror = true",
+                "[learning]\nsegment_steps = 1\nepisodes_per_epoch = 1\nmirror = true",
                 vec![],
-                vec!["learning.mirror = true", "leg_steps = 1", "set it to false"],
+                vec![
+                    "learning.mirror = true",
+                    "segment_steps = 1",
+                    "set it to false",
+                ],
             ),
             (
                 "[learning]\nhistory_steps = [4, 2]",
                 vec![],
-                vec!["learning.history_steps = [4, 2]", "does not rise"],
+                vec!["learning.history_steps = [4, 2]", "must rise"],
             ),
             (
                 "[learning]\nhistory_steps = [0, 2]",
@@ -493,7 +724,11 @@ mod tests {
                     "set it to one of them",
                 ],
             ),
-            ("[vae]\nlatent = 0", vec![], vec!["test.toml", "vae.latent = 0"]),
+            (
+                "[vae]\nlatent = 0",
+                vec![],
+                vec!["test.toml", "vae.latent = 0"],
+            ),
             (
                 "[td3]\ncritic_networks = 0",
                 vec![],
@@ -502,17 +737,25 @@ mod tests {
             (
                 "[learning]\nencoder = \"end-to-end\"\nhistory_steps = [2]",
                 vec![],
-                vec!["learning.history_steps = [2]", "end-to-end", "name none"],
+                vec!["learning.history_steps = [2]", "end-to-end", "set it to []"],
             ),
             (
                 "[learning]\nencoder = \"end-to-end\"",
                 vec!["learning.critic_input=ground-truth"],
-                vec!["learning.critic_input = ground-truth", "end-to-end", "sees no image"],
+                vec![
+                    "learning.critic_input = ground-truth",
+                    "end-to-end",
+                    "sees no image",
+                ],
             ),
             (
                 "[learning]\nencoder = \"end-to-end\"\naverage_updates = 10",
                 vec![],
-                vec!["learning.average_updates = 10", "end-to-end", "not averaged"],
+                vec![
+                    "learning.average_updates = 10",
+                    "end-to-end",
+                    "not averaged",
+                ],
             ),
             (
                 "[learning]\naverage_updates = 2000000",
@@ -535,6 +778,11 @@ mod tests {
                 vec!["run.engine = native", "end-to-end", "leave run.engine out"],
             ),
             (
+                "[learning]\nalgorithm = \"td3\"",
+                vec!["run.engine=native"],
+                vec!["run.engine = native", "td3", "leave run.engine out"],
+            ),
+            (
                 "[vae]\ndecoder = \"u-net\"",
                 vec!["run.engine=native"],
                 vec!["run.engine = native", "u-net", "leave run.engine out"],
@@ -545,9 +793,9 @@ mod tests {
                 vec!["[vae]", "unet", "u-net", "plain"],
             ),
             (
-                "[learning]\nleg_steps = 257",
+                "[learning]\nsegment_steps = 257",
                 vec![],
-                vec!["learning.leg_steps = 257", "256"],
+                vec!["learning.segment_steps = 257", "256"],
             ),
             (
                 "",

@@ -1,53 +1,68 @@
-//! `[learning]`.
+//! The `[learning]` section.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
-use crate::leg::MOST_FLOWN;
+use super::{InvalidValue, require};
+use crate::segment::MAX_PRIOR_ACTIONS;
 use crate::{ACTION, LatentCode};
 
-/// Policy updates that can be averaged over at most.
-const MOST_AVERAGED: usize = 1_000_000;
-/// Earlier moments that can be seen at most.
-const MOST_HISTORY: usize = 16;
+/// Largest `learning.average_updates`.
+const MAX_AVERAGED_UPDATES: usize = 1_000_000;
+/// Most entries of `learning.history_steps`.
+const MAX_HISTORY: usize = 16;
 
-/// `[learning]`: when is learned, how much, and from what.
+/// The `[learning]` section: the algorithm, its inputs, and how updates alternate with flying.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningSection {
-    /// What learns the policy: `sac` or `td3`, each with a section of its own. Default `sac`, as in the paper.
+    /// Learning algorithm: `sac` or `td3`, each with a section of its own. Default `sac`, as in the
+    /// paper.
     pub algorithm: AlgorithmName,
-    /// What trains the encoder that turns a depth image into the numbers the policy sees: `vae`, or `end-to-end`, where the critic's loss does and `[vae]` has no say but in
-    /// the code's length and the encoder's precision. Every transition keeps its images then, 9 KiB each. Default `vae`, as in the paper.
+    /// Training of the encoder, which turns a depth image into the policy's input. `vae` trains it
+    /// as a variational auto-encoder. `end-to-end` trains it by the critic's loss; then `[vae]`
+    /// sets only the code's length, and every transition keeps its images, 9 KiB each. Default
+    /// `vae`, as in the paper.
     pub encoder: EncoderTraining,
-    /// Flights flown with one frozen snapshot before the networks are updated. 1 is the paper's delayed learning. Default 10.
-    pub flights_per_epoch: u64,
-    /// Steps after which the networks are updated and the weights refreshed in the middle of a flight, which goes on with them. 0 waits for the flight's end, as
-    /// delayed learning does; 1 is direct updates, which the paper compares that with. One actor flies at a time then. Default 0.
-    pub leg_steps: u64,
-    /// Epochs a snapshot is behind when it is flown: 0 flies the newest; 1 lets actors fly while the learner updates. Default 0.
+    /// Episodes flown with one frozen snapshot before the networks are updated, 1 to 10,000. 1 is
+    /// the paper's delayed learning. Default 10.
+    pub episodes_per_epoch: u64,
+    /// Steps of a segment. After each segment the networks are updated, and the episode continues
+    /// with the new weights. 0 updates only after whole episodes, as delayed learning does; 1 is
+    /// direct updates, which the paper compares with. With segments, one actor flies at a time. At
+    /// most 256. Default 0.
+    pub segment_steps: u64,
+    /// Epochs by which the flown snapshot lags behind: 0 flies the newest, 1 lets actors fly while
+    /// the learner updates. Default 0.
     pub policy_lag: u64,
-    /// Policy updates per environment step, done at the end of the epoch. Default 0.5.
+    /// Policy updates per environment step, done at the end of the epoch; 0 to 100. Default 0.5.
     pub updates_per_step: f64,
-    /// Environment steps flown at random before the first update (paper: 2000). Default 2000.
+    /// Environment steps with random actions before the first update; at most `replay.capacity`.
+    /// Default 2000, as in the paper.
     pub warmup_steps: usize,
-    /// Flights before training starts from the next level (paper: 10). Default 10.
-    pub flights_per_level: u64,
-    /// Start levels that training goes through before it returns to the first (paper: 5); at most the walls of the training course. Default 5.
+    /// Episodes before training moves to the next start level; at least 1. Default 10, as in the
+    /// paper.
+    pub episodes_per_level: u64,
+    /// Start levels of training, before it returns to the first; at least 1, at most the walls of
+    /// the training course. Default 5, as in the paper.
     pub levels: u8,
-    /// What the policy sees of a moment. Default `latent`, as in the paper.
+    /// Policy input per step: `latent`, `latent+velocity` or `latent+velocity+action`. Default
+    /// `latent`, as in the paper.
     pub observation: Observation,
-    /// Earlier moments that it sees beside the present one, by how many steps they lie back, rising; before take-off all was as at take-off. What was in view a second ago no longer is when
-    /// the drone is in an opening. Default none, as in the paper.
+    /// Earlier steps that the policy also sees, as rising numbers of steps back; at most 16. Steps
+    /// before the reset count as the reset. A wall seen a second ago is out of view when the drone
+    /// is in its opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
-    /// Whether every flight is learned from twice, the second time as seen in a mirror, where left and right change places. Twice the transitions for the same steps
-    /// flown; they fill the replay twice as fast. Default false, as in the paper.
+    /// `true` stores every episode a second time, mirrored left to right. Twice the transitions
+    /// come from the same steps; they fill the replay twice as fast. Default false, as in the
+    /// paper.
     pub mirror: bool,
-    /// Policy updates over which the policy that flies is averaged, exponentially weighted; 0 flies the policy as the last update left it. Default 0, as in the paper.
+    /// Policy updates over which the flown policy is averaged, exponentially weighted; at most
+    /// 1,000,000. 0 flies the policy as the last update left it. Default 0, as in the paper.
     pub average_updates: usize,
-    /// What the critic sees. It is needed in training alone, where the simulator can tell it more than the drone sees. Default `observation`, as in the paper.
+    /// Critic input: `observation` or `ground-truth`. The critic is needed only in training, where
+    /// the simulator provides more than the drone sees. Default `observation`, as in the paper.
     pub critic_input: CriticInput,
 }
 
@@ -56,12 +71,12 @@ impl Default for LearningSection {
         Self {
             algorithm: AlgorithmName::Sac,
             encoder: EncoderTraining::Vae,
-            flights_per_epoch: 10,
-            leg_steps: 0,
+            episodes_per_epoch: 10,
+            segment_steps: 0,
             policy_lag: 0,
             updates_per_step: 0.5,
             warmup_steps: 2000,
-            flights_per_level: 10,
+            episodes_per_level: 10,
             levels: 5,
             observation: Observation::Latent,
             history_steps: Vec::new(),
@@ -73,20 +88,20 @@ impl Default for LearningSection {
 }
 
 impl LearningSection {
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
-            (1..=10_000).contains(&self.flights_per_epoch),
-            "learning.flights_per_epoch",
-            self.flights_per_epoch,
-            "is outside 1..=10000: the learner holds an epoch in memory before it learns from it",
+            (1..=10_000).contains(&self.episodes_per_epoch),
+            "learning.episodes_per_epoch",
+            self.episodes_per_epoch,
+            "is outside 1..=10000: the learner holds a whole epoch in memory before it updates",
         )?;
         require(
             self.policy_lag <= 1,
             "learning.policy_lag",
             self.policy_lag,
-            "is above 1: flying two epochs behind gains nothing over one, whose updates already overlap the flying",
+            "is above 1: a lag of 1 already overlaps updates with flying, so 2 gains nothing",
         )?;
-        self.validate_legs()?;
+        self.validate_segments()?;
         self.validate_encoder()?;
         require(
             (0.0..=100.0).contains(&self.updates_per_step),
@@ -95,119 +110,136 @@ impl LearningSection {
             "is outside [0, 100]",
         )?;
         require(
-            self.flights_per_level >= 1,
-            "learning.flights_per_level",
-            self.flights_per_level,
-            "is below 1: no flight could start",
+            self.episodes_per_level >= 1,
+            "learning.episodes_per_level",
+            self.episodes_per_level,
+            "is below 1: no episode could start",
         )?;
         require(
             self.levels >= 1,
             "learning.levels",
             self.levels,
-            "is below 1: no flight could start",
+            "is below 1: no episode could start",
         )?;
         require(
-            self.average_updates <= MOST_AVERAGED,
+            self.average_updates <= MAX_AVERAGED_UPDATES,
             "learning.average_updates",
             self.average_updates,
-            format!("is above {MOST_AVERAGED}: what flies would hardly ever change"),
+            format!("is above {MAX_AVERAGED_UPDATES}: the flown policy would hardly ever change"),
         )?;
-        let rising = |steps: &[usize]| steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0]);
+        let rising = |steps: &[usize]| {
+            steps.is_sorted_by(|earlier, later| earlier < later) && !steps.starts_with(&[0])
+        };
         require(
             rising(&self.history_steps),
             "learning.history_steps",
             format!("{:?}", self.history_steps),
-            "does not rise from 1 or more: each is a number of steps back from the present, which is always seen",
+            "must rise from 1 or more: each is a number of steps back from the present, which is \
+            always seen",
         )?;
         require(
-            self.history_steps.len() <= MOST_HISTORY,
+            self.history_steps.len() <= MAX_HISTORY,
             "learning.history_steps",
             format!("{:?}", self.history_steps),
-            format!("names more than {MOST_HISTORY} moments: each is kept with every transition"),
+            format!("lists more than {MAX_HISTORY} steps: each is stored with every transition"),
         )
     }
 
-    /// How often a flight's transitions are stored: twice if it is seen in a mirror as well.
-    pub fn times_stored(&self) -> usize {
+    /// Returns how often an episode's transitions are stored: twice with `mirror`, else once.
+    pub fn copies_per_transition(&self) -> usize {
         1 + usize::from(self.mirror)
     }
 
-    /// Whether flights are flown in legs, so that the weights are refreshed in the middle of them.
-    pub fn in_legs(&self) -> bool {
-        self.leg_steps > 0
+    /// Returns `true` if episodes are flown in segments, with new weights after each.
+    pub fn in_segments(&self) -> bool {
+        self.segment_steps > 0
     }
 
-    /// Whether policy and critic learn from depth images themselves.
+    /// Returns `true` if policy and critic learn from depth images themselves.
     pub fn end_to_end(&self) -> bool {
         self.encoder == EncoderTraining::EndToEnd
     }
 
-    /// What an encoder that the critic's loss trains does not go with.
-    fn validate_encoder(&self) -> Result<(), Invalid> {
+    /// Checks the keys that an encoder trained by the critic's loss rules out.
+    fn validate_encoder(&self) -> Result<(), InvalidValue> {
         require(
             !self.end_to_end() || self.history_steps.is_empty(),
             "learning.history_steps",
             format!("{:?}", self.history_steps),
-            "does not go with learning.encoder = \"end-to-end\", which draws the images of two moments with each transition and no earlier ones: name none, or set learning.encoder to \"vae\"",
+            "does not go with learning.encoder = \"end-to-end\", which loads the images of two \
+            steps with each transition, and no earlier ones: set it to [], or set \
+            learning.encoder to \"vae\"",
         )?;
         require(
             !self.end_to_end() || self.critic_input == CriticInput::Observation,
             "learning.critic_input",
             "ground-truth",
-            "does not go with learning.encoder = \"end-to-end\": the critic's loss trains the encoder, and this critic sees no image; set it to \"observation\", or learning.encoder to \"vae\"",
+            "does not go with learning.encoder = \"end-to-end\": the critic's loss trains the \
+            encoder, and this critic sees no image; set it to \"observation\", or \
+            learning.encoder to \"vae\"",
         )?;
         require(
             !self.end_to_end() || self.average_updates == 0,
             "learning.average_updates",
             self.average_updates,
-            "does not go with learning.encoder = \"end-to-end\": an averaged policy would see through an encoder that is not averaged; set it to 0, or learning.encoder to \"vae\"",
+            "does not go with learning.encoder = \"end-to-end\": an averaged policy would see \
+            through an encoder that is not averaged; set it to 0, or learning.encoder to \"vae\"",
         )
     }
 
-    /// One flight is under way in legs at a time: only then does each leg follow from all that was flown before.
-    fn validate_legs(&self) -> Result<(), Invalid> {
+    /// Checks the keys that segments rule out. Only with a single episode in progress does each
+    /// segment follow from everything flown before.
+    fn validate_segments(&self) -> Result<(), InvalidValue> {
         require(
-            self.leg_steps <= MOST_FLOWN as u64,
-            "learning.leg_steps",
-            self.leg_steps,
-            format!("is above {MOST_FLOWN}, the longest flight in legs: 0 learns after whole flights"),
+            self.segment_steps <= MAX_PRIOR_ACTIONS as u64,
+            "learning.segment_steps",
+            self.segment_steps,
+            format!(
+                "is above {MAX_PRIOR_ACTIONS}, the longest episode in segments; set it to 0 to \
+                update after whole episodes"
+            ),
         )?;
         for (key, value, needed) in [
-            ("learning.flights_per_epoch", self.flights_per_epoch, 1),
+            ("learning.episodes_per_epoch", self.episodes_per_epoch, 1),
             ("learning.policy_lag", self.policy_lag, 0),
         ] {
             require(
-                !self.in_legs() || value == needed,
+                !self.in_segments() || value == needed,
                 key,
                 value,
                 format!(
-                    "does not go with learning.leg_steps = {}, which refreshes the weights in the middle of the one flight that is under way: set it to {needed}, or learning.leg_steps to 0",
-                    self.leg_steps
+                    "does not go with learning.segment_steps = {}, which updates the weights in \
+                    the middle of the only episode in progress: set it to {needed}, or \
+                    learning.segment_steps to 0",
+                    self.segment_steps
                 ),
             )?;
         }
         require(
-            !self.in_legs() || !self.mirror,
+            !self.in_segments() || !self.mirror,
             "learning.mirror",
             self.mirror,
             format!(
-                "does not go with learning.leg_steps = {}: a leg is stored behind the one before it, where its mirror image would come between; set it to false, or learning.leg_steps to 0",
-                self.leg_steps
+                "does not go with learning.segment_steps = {}: segments are stored back to back, \
+                and the mirrored copy would come between; set it to false, or \
+                learning.segment_steps to 0",
+                self.segment_steps
             ),
         )?;
         require(
-            !self.in_legs() || self.history_steps.is_empty(),
+            !self.in_segments() || self.history_steps.is_empty(),
             "learning.history_steps",
             format!("{:?}", self.history_steps),
             format!(
-                "does not go with learning.leg_steps = {}: who flies a leg has not seen the ones before; name none, or set learning.leg_steps to 0",
-                self.leg_steps
+                "does not go with learning.segment_steps = {}: an actor that flies a segment has \
+                not seen the earlier ones; set it to [], or set learning.segment_steps to 0",
+                self.segment_steps
             ),
         )
     }
 }
 
-/// A learning algorithm.
+/// Learning algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AlgorithmName {
@@ -226,33 +258,36 @@ impl fmt::Display for AlgorithmName {
     }
 }
 
-/// What trains the encoder.
+/// Training of the encoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EncoderTraining {
-    /// A variational auto-encoder, which is then frozen (the paper).
+    /// Variational auto-encoder, frozen after its training (the paper).
     Vae,
-    /// The critic's loss: policy and critic see through one convolutional encoder (arXiv:1910.01741, arXiv:2004.13649).
+    /// The critic's loss: policy and critic share one convolutional encoder (arXiv:1910.01741,
+    /// arXiv:2004.13649).
     EndToEnd,
 }
 
-/// What the critic judges an action by.
+/// Input of the critic beside the action.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CriticInput {
-    /// What the policy sees.
+    /// The policy's observation.
     Observation,
-    /// What the simulator knows: where drone and openings are, how the drone moves, and what disturbs it (an asymmetric critic, arXiv:1710.06542).
+    /// The simulator's ground truth: positions of drone and openings, motion, disturbances (an
+    /// asymmetric critic, arXiv:1710.06542).
     GroundTruth,
 }
 
-/// What the policy sees of the world at a moment, in this order.
+/// Policy input per step, in this order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Observation {
     /// The latent code of the depth image alone (the paper's state).
     #[serde(rename = "latent")]
     Latent,
-    /// The latent code and the vehicle's own lateral and vertical velocity in m/s: with a sluggish vehicle one image is not a state.
+    /// The latent code and the vehicle's own lateral and vertical velocity in m/s. With a vehicle
+    /// that responds slowly, one image is not a full state.
     #[serde(rename = "latent+velocity")]
     LatentVelocity,
     /// The above and the previous action.
@@ -260,92 +295,103 @@ pub enum Observation {
     LatentVelocityAction,
 }
 
-/// What the policy sees: the present moment, then earlier ones. Actor and learner build observations by this alone.
+/// Layout of the observation vector: the present step, then earlier ones. Actor and learner both
+/// build observations by it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct View {
-    /// What is seen of each.
-    pub moment: Observation,
+pub struct ObservationLayout {
+    /// Input per step.
+    pub per_step: Observation,
     /// Length of the latent code, [`VaeSection::latent`](super::VaeSection::latent).
     pub latent: usize,
-    /// How many steps back the earlier ones lie.
+    /// Numbers of steps back of the earlier steps.
     pub history_steps: Vec<usize>,
 }
 
-impl View {
-    /// The present moment alone, with a code of `latent` numbers.
-    pub fn present(moment: Observation, latent: usize) -> Self {
+impl ObservationLayout {
+    /// Returns the layout of the present step alone, with a code of `latent` numbers.
+    pub fn present(per_step: Observation, latent: usize) -> Self {
         Self {
-            moment,
+            per_step,
             latent,
             history_steps: Vec::new(),
         }
     }
 
-    /// Length of what is seen of a moment.
-    pub fn moment_len(&self) -> usize {
+    /// Returns the input length per step.
+    pub fn step_len(&self) -> usize {
         self.latent
-            + match self.moment {
+            + match self.per_step {
                 Observation::Latent => 0,
                 Observation::LatentVelocity => 2,
                 Observation::LatentVelocityAction => 2 + ACTION,
             }
     }
 
-    /// Length of the observation vector.
+    /// Returns the length of the observation vector.
     pub fn len(&self) -> usize {
-        self.moment_len() * (1 + self.history_steps.len())
+        self.step_len() * (1 + self.history_steps.len())
     }
 
-    /// Never: the present is always seen.
+    /// Returns `false`: the present step is always seen.
     pub fn is_empty(&self) -> bool {
         false
     }
 
-    /// Writes what is seen of a moment: the latent code, `velocity_mps` the vehicle's forward, left and up velocity, `previous_action` zero at take-off.
+    /// Writes the input of one step: latent code, then parts of `velocity_mps` (the vehicle's
+    /// forward, left and up velocity) and `previous_action` (zero at reset).
     ///
     /// # Panics
-    /// When `into` is not [`View::moment_len`] long.
-    pub fn write_moment(
+    /// If `into` is not [`ObservationLayout::step_len`] long.
+    pub fn write_step(
         &self,
         code: &LatentCode,
         velocity_mps: &[f32; 3],
         previous_action: &[f32; ACTION],
         into: &mut [f32],
     ) {
-        assert_eq!(into.len(), self.moment_len(), "what is seen has a fixed length");
+        assert_eq!(
+            into.len(),
+            self.step_len(),
+            "the input per step has a fixed length"
+        );
         self.write_code(code, into);
         let rest = &mut into[self.latent..];
-        if self.moment != Observation::Latent {
+        if self.per_step != Observation::Latent {
             rest[..2].copy_from_slice(&velocity_mps[1..]);
         }
-        if self.moment == Observation::LatentVelocityAction {
+        if self.per_step == Observation::LatentVelocityAction {
             rest[2..].copy_from_slice(previous_action);
         }
     }
 
-    /// Writes the latent code alone, where it lies in what is seen of a moment.
+    /// Writes only the latent code, at its place within the input of one step.
     ///
     /// # Panics
-    /// When `into` is shorter than the code.
+    /// If `into` is shorter than the code.
     pub fn write_code(&self, code: &LatentCode, into: &mut [f32]) {
         into[..self.latent].copy_from_slice(&code[..self.latent]);
     }
 
-    /// The moments seen at `step` of a flight, by their steps, in the vector's order; before take-off there was the take-off.
-    pub fn moments(&self, step: usize) -> impl Iterator<Item = usize> {
+    /// Returns the steps seen at `step` of an episode, in the vector's order. Steps before the
+    /// reset are replaced by the reset.
+    pub fn seen_steps(&self, step: usize) -> impl Iterator<Item = usize> {
         std::iter::once(0)
             .chain(self.history_steps.iter().copied())
             .map(move |back| step.saturating_sub(back))
     }
 
-    /// Writes the observation vector at `step` of a flight, of which `write_moment` writes what is seen of a step's moment.
+    /// Writes the observation vector at `step` of an episode. `write_step` writes the input of one
+    /// step.
     ///
     /// # Panics
-    /// When `into` is not [`View::len`] long.
-    pub fn write(&self, step: usize, into: &mut [f32], write_moment: impl Fn(usize, &mut [f32])) {
+    /// If `into` is not [`ObservationLayout::len`] long.
+    pub fn write(&self, step: usize, into: &mut [f32], write_step: impl Fn(usize, &mut [f32])) {
         assert_eq!(into.len(), self.len(), "an observation has a fixed length");
-        for (moment, into) in self.moments(step).zip(into.chunks_exact_mut(self.moment_len())) {
-            write_moment(moment, into);
+        for (seen_step, into) in self
+            .seen_steps(step)
+            .zip(into.chunks_exact_mut(self.step_len()))
+        {
+            write_step(seen_step, into);
         }
     }
 }

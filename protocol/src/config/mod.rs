@@ -1,7 +1,8 @@
-//! The configuration of a run: one file, one struct, one section each.
+//! The configuration of a run: one file, one struct, one struct per section.
 //!
-//! Every key has a default beside its documentation, unknown keys are refused, and [`Config::validate`] says which key is wrong, why, and what would
-//! happen. The `[simulator]` section belongs to the simulator and is passed on untouched: this crate does not know physics.
+//! Every key documents its default, unknown keys are refused, and [`Config::validate`] reports the
+//! wrong key, the reason and the consequence. The `[simulator]` section belongs to the simulator
+//! and is passed on unread: this crate knows no physics.
 
 mod courses;
 mod evaluation;
@@ -17,26 +18,28 @@ mod vae;
 
 use serde::{Deserialize, Serialize};
 
-use crate::leg::MOST_FLOWN;
+use crate::segment::MAX_PRIOR_ACTIONS;
 
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
-pub use file::{ConfigError, culprit};
-pub use learning::{AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, View};
+pub use file::{ConfigError, failing_override};
+pub use learning::{
+    AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
+};
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use td3::Td3Section;
 pub use transport::TransportSection;
-pub use vae::{DecoderName, Precision, VaeSection};
+pub use vae::{DecoderName, VaeSection};
 
-/// Everything that determines a run.
+/// The whole configuration of a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Seed, length, device.
+    /// Seed, length, device, engine.
     pub run: RunSection,
-    /// What is flown through.
+    /// Courses.
     pub courses: CoursesSection,
     /// Delayed learning: epochs, lag, warm-up, updates.
     pub learning: LearningSection,
@@ -48,18 +51,19 @@ pub struct Config {
     pub vae: VaeSection,
     /// Split replay buffer.
     pub replay: ReplaySection,
-    /// Evaluation flights.
+    /// Evaluation episodes.
     pub evaluation: EvaluationSection,
-    /// What is stored, and when.
+    /// Checkpoints.
     pub checkpoints: CheckpointSection,
-    /// Limits and deadlines between the processes; without influence on what is learned.
+    /// Limits and deadlines between the processes. They do not influence learning.
     pub transport: TransportSection,
-    /// Vehicle, camera, reward, course generator, disturbances: see the simulator's `SimulatorSettings`.
+    /// Vehicle, camera, reward, course generator, disturbances: see the simulator's
+    /// `SimulatorSettings`.
     pub simulator: toml::Table,
 }
 
 impl Config {
-    /// Transitions in a minibatch of the algorithm that is used.
+    /// Returns the number of transitions in a minibatch of the configured algorithm.
     pub fn batch_size(&self) -> usize {
         self.batch_size_by_key().1
     }
@@ -71,28 +75,29 @@ impl Config {
         }
     }
 
-    /// What the policy sees.
-    pub fn view(&self) -> View {
-        View {
-            moment: self.learning.observation,
+    /// Returns the layout of the policy's observation.
+    pub fn observation_layout(&self) -> ObservationLayout {
+        ObservationLayout {
+            per_step: self.learning.observation,
             latent: self.vae.latent,
             history_steps: self.learning.history_steps.clone(),
         }
     }
 
-    /// What computes policy and critic: the run's engine, but what learns from images is written for libtorch alone.
+    /// Returns the engine of policy and critic: the run's engine, except that TD3 and learning from
+    /// images exist for libtorch only.
     pub fn policy_engine(&self) -> Engine {
-        match self.learning.encoder {
-            EncoderTraining::Vae => self.run.engine(),
-            EncoderTraining::EndToEnd => Engine::Libtorch,
+        match (self.learning.algorithm, self.learning.encoder) {
+            (AlgorithmName::Sac, EncoderTraining::Vae) => self.run.engine(),
+            (AlgorithmName::Td3, _) | (_, EncoderTraining::EndToEnd) => Engine::Libtorch,
         }
     }
 
-    /// Checks every key, and keys against each other.
+    /// Checks every key, and combinations of keys.
     ///
     /// # Errors
-    /// [`Invalid`] names the first key found wrong, its value, the bound and the consequence.
-    pub fn validate(&self) -> Result<(), Invalid> {
+    /// [`InvalidValue`] names the first wrong key, its value, the bound and the consequence.
+    pub fn validate(&self) -> Result<(), InvalidValue> {
         self.run.validate()?;
         self.courses.validate()?;
         self.learning.validate()?;
@@ -105,21 +110,23 @@ impl Config {
         self.transport.validate()?;
         let depth = 1 + self.simulator.values().map(nesting).max().unwrap_or(0);
         require(
-            depth <= DEEPEST,
+            depth <= MAX_NESTING,
             "simulator",
             format!("nested {depth} deep"),
-            format!("is deeper than {DEEPEST}: what is written of it could not be read back"),
+            format!(
+                "is deeper than {MAX_NESTING}: the stored configuration could not be read back"
+            ),
         )?;
         require(
             self.learning.warmup_steps <= self.replay.capacity,
             "learning.warmup_steps",
             self.learning.warmup_steps,
             format!(
-                "exceeds replay.capacity = {}: the learner would wait for ever",
+                "exceeds replay.capacity = {}: the learner would wait forever",
                 self.replay.capacity
             ),
         )?;
-        self.validate_legs()?;
+        self.validate_segments()?;
         self.validate_encoder()?;
         let (key, batch_size) = self.batch_size_by_key();
         require(
@@ -127,31 +134,36 @@ impl Config {
             key,
             batch_size,
             format!(
-                "exceeds learning.warmup_steps = {}: the first update would have too few transitions to draw from",
+                "exceeds learning.warmup_steps = {}: the first update would have too few \
+                transitions to draw from",
                 self.learning.warmup_steps
             ),
         )
     }
 
-    /// What ways of training the encoder ask of other sections.
-    fn validate_encoder(&self) -> Result<(), Invalid> {
+    /// Checks what `learning.encoder` requires of other sections.
+    fn validate_encoder(&self) -> Result<(), InvalidValue> {
         let (end_to_end, decoder) = (self.learning.end_to_end(), self.vae.decoder);
         require(
             !end_to_end || decoder == DecoderName::Plain,
             "vae.decoder",
             "u-net",
-            "does not go with learning.encoder = \"end-to-end\", where there is no VAE: set it to \"plain\", or learning.encoder to \"vae\"",
+            "does not go with learning.encoder = \"end-to-end\", where there is no VAE: set it \
+            to \"plain\", or learning.encoder to \"vae\"",
         )?;
         require(
-            !end_to_end || self.replay.capacity <= MOST_WITH_IMAGES,
+            !end_to_end || self.replay.capacity <= MAX_CAPACITY_WITH_IMAGES,
             "replay.capacity",
             self.replay.capacity,
             format!(
-                "is above {MOST_WITH_IMAGES}, and learning.encoder = \"end-to-end\": every transition keeps a depth image, 9 KiB"
+                "is above {MAX_CAPACITY_WITH_IMAGES}, and learning.encoder = \"end-to-end\": \
+                every transition keeps a depth image of 9 KiB"
             ),
         )?;
         let is_native = self.run.engine == Some(Engine::Native);
+        let td3 = self.learning.algorithm == AlgorithmName::Td3;
         for (asked, key) in [
+            (td3, "learning.algorithm = \"td3\""),
             (end_to_end, "learning.encoder = \"end-to-end\""),
             (decoder == DecoderName::UNet, "vae.decoder = \"u-net\""),
         ] {
@@ -160,42 +172,53 @@ impl Config {
                 "run.engine",
                 Engine::Native,
                 format!(
-                    "does not compute {key}, which is written for libtorch: leave run.engine out, or set it to \"libtorch\""
+                    "does not compute {key}, which exists for libtorch only: leave run.engine \
+                    out, or set it to \"libtorch\""
                 ),
             )?;
         }
         Ok(())
     }
 
-    /// What flights in legs ask of other sections.
-    fn validate_legs(&self) -> Result<(), Invalid> {
-        let (leg_steps, longest) = (self.learning.leg_steps, self.transport.max_records_per_flight);
+    /// Checks what segments require of other sections.
+    fn validate_segments(&self) -> Result<(), InvalidValue> {
+        let (segment_steps, longest) = (
+            self.learning.segment_steps,
+            self.transport.max_records_per_episode,
+        );
         require(
-            !self.learning.in_legs() || self.replay.success == SuccessRule::LevelUp || self.replay.success_share == 0.0,
+            !self.learning.in_segments()
+                || self.replay.success == SuccessRule::LevelUp
+                || self.replay.success_share == 0.0,
             "replay.success",
             "approach",
             format!(
-                "does not go with learning.leg_steps = {leg_steps}: the steps before a level-up are stored and learned from by then; set it to \"level-up\", or learning.leg_steps to 0"
+                "does not go with learning.segment_steps = {segment_steps}: the steps before a \
+                level-up have already been stored and learned from; set it to \"level-up\", or \
+                learning.segment_steps to 0"
             ),
         )?;
         require(
-            !self.learning.in_legs() || longest <= MOST_FLOWN,
-            "transport.max_records_per_flight",
+            !self.learning.in_segments() || longest <= MAX_PRIOR_ACTIONS,
+            "transport.max_records_per_episode",
             longest,
             format!(
-                "is above {MOST_FLOWN}, and learning.leg_steps = {leg_steps}: the ticket of a leg has no room for more actions flown before; lower it, and simulator.max_steps if need be, or set learning.leg_steps to 0"
+                "is above {MAX_PRIOR_ACTIONS}, and learning.segment_steps = {segment_steps}: the \
+                ticket of a segment has no room for more earlier actions; lower it, and \
+                simulator.max_steps if need be, or set learning.segment_steps to 0"
             ),
         )
     }
 }
 
-/// Transitions held at most where each keeps its image: 1.8 GB of images.
-const MOST_WITH_IMAGES: usize = 200_000;
+/// Largest `replay.capacity` if each transition keeps its image: 1.8 GB of images.
+const MAX_CAPACITY_WITH_IMAGES: usize = 200_000;
 
-/// How deep sections, tables and lists may lie within each other: the parser of TOML itself ends at 80, and recursion at the end of the stack.
-pub(crate) const DEEPEST: usize = 16;
+/// Deepest nesting of sections, tables and lists. The TOML parser itself fails at 80, and deeper
+/// recursion would overflow the stack.
+pub(crate) const MAX_NESTING: usize = 16;
 
-/// Lists and tables within each other in `value`.
+/// Returns the nesting depth of lists and tables in `value`.
 fn nesting(value: &toml::Value) -> usize {
     match value {
         toml::Value::Array(values) => 1 + values.iter().map(nesting).max().unwrap_or(0),
@@ -204,25 +227,33 @@ fn nesting(value: &toml::Value) -> usize {
     }
 }
 
-/// A key whose value makes no sense.
+/// A key with a wrong value.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key} = {value} {problem}")]
-pub struct Invalid {
+pub struct InvalidValue {
     /// `section.key`.
     pub key: &'static str,
-    /// The value found.
+    /// The value.
     pub value: String,
-    /// The bound and what its violation would lead to.
+    /// The violated bound and the consequence.
     pub problem: String,
 }
 
-/// The check of a network's width.
-pub(crate) fn require_width(key: &'static str, width: usize) -> Result<(), Invalid> {
-    require((1..=4096).contains(&width), key, width, "is outside 1..=4096")
+/// Checks a network's width.
+pub(crate) fn require_width(key: &'static str, width: usize) -> Result<(), InvalidValue> {
+    require(
+        (1..=4096).contains(&width),
+        key,
+        width,
+        "is outside 1..=4096",
+    )
 }
 
-/// The check of a minibatch of transitions.
-pub(crate) fn require_batch_size(key: &'static str, transitions: usize) -> Result<(), Invalid> {
+/// Checks the size of a minibatch of transitions.
+pub(crate) fn require_batch_size(
+    key: &'static str,
+    transitions: usize,
+) -> Result<(), InvalidValue> {
     require(
         (1..=65_536).contains(&transitions),
         key,
@@ -231,8 +262,11 @@ pub(crate) fn require_batch_size(key: &'static str, transitions: usize) -> Resul
     )
 }
 
-/// One network for both estimates, or one each.
-pub(crate) fn require_critic_networks(key: &'static str, networks: usize) -> Result<(), Invalid> {
+/// Checks the number of critic networks: one for both estimates, or one each.
+pub(crate) fn require_critic_networks(
+    key: &'static str,
+    networks: usize,
+) -> Result<(), InvalidValue> {
     require(
         (1..=2).contains(&networks),
         key,
@@ -241,8 +275,8 @@ pub(crate) fn require_critic_networks(key: &'static str, networks: usize) -> Res
     )
 }
 
-/// The check of Adam's step size.
-pub(crate) fn require_learning_rate(key: &'static str, rate: f64) -> Result<(), Invalid> {
+/// Checks Adam's step size.
+pub(crate) fn require_learning_rate(key: &'static str, rate: f64) -> Result<(), InvalidValue> {
     require(
         rate > 0.0 && rate <= 1.0,
         key,
@@ -251,8 +285,8 @@ pub(crate) fn require_learning_rate(key: &'static str, rate: f64) -> Result<(), 
     )
 }
 
-/// The check of γ.
-pub(crate) fn require_discount(key: &'static str, discount: f64) -> Result<(), Invalid> {
+/// Checks the discount γ.
+pub(crate) fn require_discount(key: &'static str, discount: f64) -> Result<(), InvalidValue> {
     require(
         (0.0..1.0).contains(&discount),
         key,
@@ -261,18 +295,18 @@ pub(crate) fn require_discount(key: &'static str, discount: f64) -> Result<(), I
     )
 }
 
-/// One check of one key: reads as "require that … holds".
+/// Returns an error if a condition on a key does not hold: reads as "require that … holds".
 #[allow(clippy::fn_params_excessive_bools)] // the condition is the point
 pub(crate) fn require(
     holds: bool,
     key: &'static str,
     value: impl std::fmt::Display,
     problem: impl Into<String>,
-) -> Result<(), Invalid> {
+) -> Result<(), InvalidValue> {
     if holds {
         Ok(())
     } else {
-        Err(Invalid {
+        Err(InvalidValue {
             key,
             value: value.to_string(),
             problem: problem.into(),

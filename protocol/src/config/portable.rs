@@ -1,4 +1,5 @@
-//! What of a configuration is the same wherever the run's directory lies: for comparing two of them.
+//! The part of a configuration that does not depend on the location of the run's directory, for
+//! comparing configurations.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -9,7 +10,8 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::Config;
 
 impl Config {
-    /// The whole configuration as TOML, but of course files the names only, so that a run's directory can be moved.
+    /// Returns the whole configuration as TOML, with only the names of course files, so that a
+    /// run's directory can be moved.
     pub fn portable(&self) -> String {
         let mut portable = self.clone();
         for course in portable.courses.paths_mut() {
@@ -18,36 +20,59 @@ impl Config {
         portable.to_toml()
     }
 
-    /// Fingerprint of the [portable](Config::portable) configuration; processes of one run compare it.
+    /// Returns a fingerprint of the [portable](Config::portable) configuration. Processes of one
+    /// run compare it.
     pub fn digest(&self) -> u64 {
         Self::digest_of(&self.portable())
     }
 
-    /// The digest of the configuration whose portable text is `portable`.
-    pub(crate) fn digest_of(portable: &str) -> u64 {
+    /// Returns the digest of the configuration whose portable text is `portable`.
+    pub fn digest_of(portable: &str) -> u64 {
         xxh3_64(portable.as_bytes())
     }
 
-    /// In what `other`, the portable text of another configuration, differs from this one: for each key `section.key = value there, value here`.
+    /// Returns `run.episodes` of `other`, the portable text of another configuration, if that is
+    /// smaller than this one's and nothing else differs.
+    pub fn lengthened_from(&self, other: &str) -> Option<u64> {
+        let table: toml::Table = toml::from_str(other).ok()?;
+        let episodes = table.get("run")?.get("episodes")?.as_integer()?;
+        let mut shorter = self.clone();
+        shorter.run.episodes = episodes.try_into().ok()?;
+        (shorter.run.episodes < self.run.episodes && shorter.portable() == other)
+            .then_some(shorter.run.episodes)
+    }
+
+    /// Returns the keys in which `other`, the portable text of another configuration, differs from
+    /// this one: for each key `section.key = value there, value here`.
     ///
     /// # Errors
-    /// When `other` is not TOML.
+    /// If `other` is not TOML.
     pub fn differences(&self, other: &str) -> Result<Vec<String>, toml::de::Error> {
         let there = flat(&toml::from_str(other)?);
-        let here = flat(&toml::from_str(&self.portable()).expect("what was written as TOML is TOML"));
+        let here =
+            flat(&toml::from_str(&self.portable()).expect("what was written as TOML is TOML"));
         let keys: std::collections::BTreeSet<&String> = there.keys().chain(here.keys()).collect();
         let value = |values: &BTreeMap<String, String>, key: &str| {
-            values.get(key).cloned().unwrap_or_else(|| "nothing".to_owned())
+            values
+                .get(key)
+                .cloned()
+                .unwrap_or_else(|| "nothing".to_owned())
         };
         Ok(keys
             .into_iter()
             .filter(|&key| there.get(key) != here.get(key))
-            .map(|key| format!("{key} = {} there, {} here", value(&there, key), value(&here, key)))
+            .map(|key| {
+                format!(
+                    "{key} = {} there, {} here",
+                    value(&there, key),
+                    value(&here, key)
+                )
+            })
             .collect())
     }
 }
 
-/// Values in TOML's notation by their full keys.
+/// Returns the values in TOML's notation by their full keys.
 fn flat(table: &Table) -> BTreeMap<String, String> {
     let mut values = BTreeMap::new();
     for (key, value) in table {
@@ -74,12 +99,18 @@ mod tests {
     #[test]
     fn two_configurations_differ_in_the_keys_that_differ() {
         let here = Config::default();
-        assert_eq!(here.differences(&here.portable()).unwrap(), Vec::<String>::new());
+        assert_eq!(
+            here.differences(&here.portable()).unwrap(),
+            Vec::<String>::new()
+        );
         let mut there = here.clone();
         there.sac.discount = 0.5;
         there.simulator.insert(
             "vehicle".into(),
-            Value::Table(Table::from_iter([("preset".to_owned(), Value::from("point"))])),
+            Value::Table(Table::from_iter([(
+                "preset".to_owned(),
+                Value::from("point"),
+            )])),
         );
         let differences = here.differences(&there.portable()).unwrap();
         assert_eq!(
@@ -92,10 +123,11 @@ mod tests {
     }
 
     #[test]
-    fn where_the_courses_lie_makes_no_difference() {
+    fn the_digest_does_not_depend_on_the_courses_folder() {
         let here = Config::default();
         let mut moved = here.clone();
-        moved.courses.training = PathBuf::from("/elsewhere").join(here.courses.training.file_name().unwrap());
+        moved.courses.training =
+            PathBuf::from("/elsewhere").join(here.courses.training.file_name().unwrap());
         assert_eq!(moved.digest(), here.digest());
         assert!(here.differences(&moved.portable()).unwrap().is_empty());
     }

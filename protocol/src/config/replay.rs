@@ -1,21 +1,24 @@
-//! `[replay]`.
+//! The `[replay]` section.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{InvalidValue, require};
 
-/// `[replay]`: the split replay buffer (paper, section 3.5).
+/// The `[replay]` section: the split replay buffer (paper, section 3.5).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReplaySection {
-    /// Transitions held in both parts together (paper: 2^17). Default 131072.
+    /// Transitions in both parts together, 256 to 2^24; some 300 bytes each. Default 131072, as in
+    /// the paper (2^17).
     pub capacity: usize,
-    /// Share of the capacity, and of every minibatch, that belongs to success experience (paper: 0.125); with 0 there is one part for everything, as in
-    /// ordinary SAC. Default 0.125.
+    /// Share of the capacity, and of every minibatch, reserved for success experience; in [0, 1). 0
+    /// keeps everything in one part, as in ordinary SAC. Default 0.125, as in the paper.
     pub success_share: f64,
-    /// What counts as success experience; the paper does not say. Default `level-up`.
+    /// Definition of success experience: `level-up` or `approach`. The paper gives none. Default
+    /// `level-up`.
     pub success: SuccessRule,
-    /// Steps that led to the level-up and count as success with it; only for `success = "approach"`. Default 5.
+    /// Steps before the level-up that also count as success, 1 to 1000; only for `success =
+    /// "approach"`. Default 5.
     pub approach_steps: usize,
 }
 
@@ -31,7 +34,7 @@ impl Default for ReplaySection {
 }
 
 impl ReplaySection {
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
             (256..=1 << 24).contains(&self.capacity),
             "replay.capacity",
@@ -42,7 +45,8 @@ impl ReplaySection {
             (0.0..1.0).contains(&self.success_share),
             "replay.success_share",
             self.success_share,
-            "is outside [0, 1): nothing but success experience would ever be learned from; 0 keeps everything in one part",
+            "is outside [0, 1): minibatches would hold nothing but success experience; 0 keeps \
+            everything in one part",
         )?;
         require(
             (1..=1000).contains(&self.approach_steps),
@@ -53,12 +57,12 @@ impl ReplaySection {
     }
 }
 
-/// Which transitions go into the success part.
+/// Transitions that go into the success part.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SuccessRule {
-    /// The step in which a wall was crossed or the destination reached.
+    /// The step that crossed a wall or reached the destination.
     LevelUp,
-    /// That step and the `approach_steps` before it, in which the obstacle was avoided.
+    /// The same step and the `approach_steps` before it, in which the drone avoided the obstacle.
     Approach,
 }

@@ -1,29 +1,31 @@
-//! `[run]` and `[checkpoints]`.
+//! The `[run]` and `[checkpoints]` sections.
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{InvalidValue, require};
 
-/// `[run]`: seed, length, device, engine.
+/// The `[run]` section: seed, length, device, engine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunSection {
-    /// Everything random in the run derives from it. Default 1.
+    /// Seed of everything random in the run. Default 1.
     pub seed: u64,
-    /// Training flights in the whole run. Default 2000.
-    pub flights: u64,
-    /// Where the learner computes: `cpu` or `cuda:N`. Default `cpu`.
+    /// Training episodes of the run, 1 to 2^62 - 1. Default 2000.
+    pub episodes: u64,
+    /// Device of the learner: `cpu` or `cuda:N`. Default `cpu`.
     pub device: Device,
-    /// What computes the learner's networks: `native` or `libtorch`. Part of the result: the two add in different orders. Default: `native` on the
-    /// processor, `libtorch` on a CUDA device, where there is no other. Convolutions that `learning.encoder = "end-to-end"` or `vae.decoder = "u-net"` train are on `libtorch` in
-    /// any case; asking for `native` is refused then.
+    /// Engine of the learner's networks: `native` or `libtorch`. The two sum in different orders,
+    /// so results differ. Default: `native` on the processor, `libtorch` on a CUDA device, which
+    /// `native` does not support. Three settings need `libtorch` and refuse an explicit `native`:
+    /// `learning.algorithm = "td3"` and `learning.encoder = "end-to-end"` for policy and critic,
+    /// `vae.decoder = "u-net"` for the VAE. All other networks use the default engine.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub engine: Option<Engine>,
-    /// Threads that the learner's networks are computed with. Of the engine `libtorch` part of the result, as another count sums in another order; of `native` not.
-    /// Default 2.
+    /// Threads of the learner's networks, 1 to 256. With `libtorch` the count changes the order of
+    /// sums and thus the result; with `native` it does not. Default 2.
     pub learner_threads: usize,
 }
 
@@ -31,7 +33,7 @@ impl Default for RunSection {
     fn default() -> Self {
         Self {
             seed: 1,
-            flights: 2000,
+            episodes: 2000,
             device: Device::Cpu,
             engine: None,
             learner_threads: 2,
@@ -40,7 +42,7 @@ impl Default for RunSection {
 }
 
 impl RunSection {
-    /// The engine that is used: the one asked for, or the device's own.
+    /// Returns the engine in use: the configured one, or the device's default.
     pub fn engine(&self) -> Engine {
         self.engine.unwrap_or(match self.device {
             Device::Cpu => Engine::Native,
@@ -48,25 +50,26 @@ impl RunSection {
         })
     }
 
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
-            self.flights >= 1,
-            "run.flights",
-            self.flights,
+            self.episodes >= 1,
+            "run.episodes",
+            self.episodes,
             "is below 1: nothing would be flown",
         )?;
         require(
-            self.flights < 1 << 62,
-            "run.flights",
-            self.flights,
-            "is not below 2^62: flight numbers would run out",
+            self.episodes < 1 << 62,
+            "run.episodes",
+            self.episodes,
+            "is not below 2^62: episode numbers would run out",
         )?;
         require(
             self.engine != Some(Engine::Native) || self.device == Device::Cpu,
             "run.engine",
             Engine::Native,
             format!(
-                "cannot compute on run.device = {}: leave run.engine out, or set it to \"libtorch\", or run.device to \"cpu\"",
+                "cannot compute on run.device = {}: leave run.engine out, or set it to \
+                \"libtorch\", or run.device to \"cpu\"",
                 self.device
             ),
         )?;
@@ -79,7 +82,7 @@ impl RunSection {
     }
 }
 
-/// A device the learner can compute on.
+/// Device of the learner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Device {
@@ -127,13 +130,14 @@ impl From<Device> for String {
     }
 }
 
-/// What computes the learner's networks.
+/// Engine of the learner's networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Engine {
-    /// Kernels of our own, on the processor: the same bits on every one, for any number of threads.
+    /// Skein's own kernels, on the processor: bit-identical results with every instruction set and
+    /// for any number of threads.
     Native,
-    /// libtorch with its automatic gradients: the reference, and the way to a CUDA device.
+    /// libtorch with automatic gradients: the reference, and the engine for CUDA devices.
     Libtorch,
 }
 
@@ -146,32 +150,33 @@ impl fmt::Display for Engine {
     }
 }
 
-/// `[checkpoints]`: what is stored, and when.
+/// The `[checkpoints]` section.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CheckpointSection {
-    /// Training flights between two checkpoints; one more is written at the end. Default 100.
-    pub every_flights: u64,
-    /// Checkpoints kept; older ones are removed. Default 2.
+    /// Training episodes between two checkpoints, at least 1; one more is written at the end.
+    /// Default 100.
+    pub every_episodes: u64,
+    /// Checkpoints kept, at least 1; older ones are removed. Default 2.
     pub keep: usize,
 }
 
 impl Default for CheckpointSection {
     fn default() -> Self {
         Self {
-            every_flights: 100,
+            every_episodes: 100,
             keep: 2,
         }
     }
 }
 
 impl CheckpointSection {
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
-            self.every_flights >= 1,
-            "checkpoints.every_flights",
-            self.every_flights,
-            "is below 1: no flight would ever complete the interval",
+            self.every_episodes >= 1,
+            "checkpoints.every_episodes",
+            self.every_episodes,
+            "is below 1: no episode would ever complete the interval",
         )?;
         require(
             self.keep >= 1,

@@ -1,37 +1,42 @@
-//! `[sac]`.
+//! The `[sac]` section.
 
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
-    require_width,
+    InvalidValue, require, require_batch_size, require_critic_networks, require_discount,
+    require_learning_rate, require_width,
 };
 use crate::ACTION;
 
-/// `[sac]`: soft actor-critic with learned temperature (arXiv:1812.05905). The paper leaves every value here open.
+/// The `[sac]` section: soft actor-critic with learned temperature (arXiv:1812.05905). The paper
+/// specifies none of these values.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SacSection {
-    /// Width of the hidden layers of policy (three) and critic (two). Default 256, as in arXiv:1812.05905.
+    /// Width of the hidden layers of policy (three) and critic (two), 1 to 4096. Default 256, as in
+    /// arXiv:1812.05905.
     pub hidden_width: usize,
-    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
-    /// one of a value that both overrate less often. Default 1.
+    /// Networks that estimate Q twice: 1, with two outputs (paper), or 2, with one output each.
+    /// Errors of two networks are less correlated, so the smaller estimate overrates Q less often.
+    /// Default 1.
     pub critic_networks: usize,
-    /// Transitions in a minibatch. Default 256, as in arXiv:1812.05905.
+    /// Transitions in a minibatch, 1 to 65,536. Default 256, as in arXiv:1812.05905.
     pub batch_size: usize,
-    /// Adam's step size for the policy. Default 3e-4, as in arXiv:1812.05905.
+    /// Adam's step size for the policy, in (0, 1]. Default 3e-4, as in arXiv:1812.05905.
     pub policy_learning_rate: f64,
-    /// Adam's step size for the critic. Default 3e-4.
+    /// Adam's step size for the critic, in (0, 1]. Default 3e-4.
     pub critic_learning_rate: f64,
-    /// Adam's step size for the temperature's logarithm. Default 3e-4.
+    /// Adam's step size for the logarithm of the temperature, in (0, 1]. Default 3e-4.
     pub temperature_learning_rate: f64,
-    /// Discount per control period, γ. Default 0.99.
+    /// Discount γ per control period, in [0, 1). Default 0.99.
     pub discount: f64,
-    /// Share of the critic that moves into the target network at each update, τ. Default 0.005.
+    /// Share τ of the critic that moves into the target network at each update, in (0, 1]. Default
+    /// 0.005.
     pub target_rate: f64,
-    /// Temperature before the first update, α. Default 0.2.
+    /// Temperature α before the first update, above 0. Default 0.2.
     pub initial_temperature: f64,
-    /// Entropy the temperature is steered towards. Default `auto`: minus the action's dimensions.
+    /// Entropy in nats that the temperature steers towards, or `auto`: minus the number of action
+    /// dimensions. Default `auto`.
     pub target_entropy: TargetEntropy,
 }
 
@@ -53,14 +58,17 @@ impl Default for SacSection {
 }
 
 impl SacSection {
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require_width("sac.hidden_width", self.hidden_width)?;
         require_critic_networks("sac.critic_networks", self.critic_networks)?;
         require_batch_size("sac.batch_size", self.batch_size)?;
         for (key, rate) in [
             ("sac.policy_learning_rate", self.policy_learning_rate),
             ("sac.critic_learning_rate", self.critic_learning_rate),
-            ("sac.temperature_learning_rate", self.temperature_learning_rate),
+            (
+                "sac.temperature_learning_rate",
+                self.temperature_learning_rate,
+            ),
         ] {
             require_learning_rate(key, rate)?;
         }
@@ -86,19 +94,19 @@ impl SacSection {
     }
 }
 
-/// The entropy a policy is held at by its temperature.
+/// Target entropy of the policy.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum TargetEntropy {
     /// A value in nats.
     Nats(f64),
-    /// Minus the number of the action's dimensions (arXiv:1812.05905, appendix D).
+    /// Minus the number of action dimensions (arXiv:1812.05905, appendix D).
     #[serde(with = "auto")]
     Auto,
 }
 
 impl TargetEntropy {
-    /// The entropy in nats.
+    /// Returns the entropy in nats.
     pub fn value(self) -> f64 {
         match self {
             Self::Auto => -(ACTION as f64),
@@ -107,7 +115,7 @@ impl TargetEntropy {
     }
 }
 
-/// The word `auto` for [`TargetEntropy::Auto`].
+/// Serialization of [`TargetEntropy::Auto`] as the word `auto`.
 mod auto {
     use serde::{Deserialize, Deserializer, Serializer, de::Error};
 

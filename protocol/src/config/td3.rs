@@ -1,39 +1,47 @@
-//! `[td3]`.
+//! The `[td3]` section.
 
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Invalid, require, require_batch_size, require_critic_networks, require_discount, require_learning_rate,
-    require_width,
+    InvalidValue, require, require_batch_size, require_critic_networks, require_discount,
+    require_learning_rate, require_width,
 };
 
-/// `[td3]`: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018, arXiv:1802.09477), which the paper compares with (its Fig. 11) without saying any of these
-/// values. Networks are as wide and minibatches as large as in `[sac]` by default, so that the two are compared on equal terms.
+/// The `[td3]` section: twin delayed deep deterministic policy gradient (Fujimoto et al. 2018,
+/// arXiv:1802.09477).
+///
+/// The paper compares with it (its Fig. 11) but specifies none of these values. Networks and
+/// minibatches default to the sizes in `[sac]`, so that the two are compared on equal terms. Policy
+/// and critic run on libtorch on any device, the VAE on `run.engine`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Td3Section {
-    /// Width of the hidden layers of policy (three) and critic (two). Default 256.
+    /// Width of the hidden layers of policy (three) and critic (two), 1 to 4096. Default 256.
     pub hidden_width: usize,
-    /// Networks that give the critic's two estimates of Q: 1, with two outputs (paper), or 2, with one each, whose errors have less in common, so that the smaller estimate is
-    /// one of a value that both overrate less often. Default 1.
+    /// Networks that estimate Q twice: 1, with two outputs (paper), or 2, with one output each.
+    /// Errors of two networks are less correlated, so the smaller estimate overrates Q less often.
+    /// Default 1.
     pub critic_networks: usize,
-    /// Transitions in a minibatch. Default 256.
+    /// Transitions in a minibatch, 1 to 65,536. Default 256.
     pub batch_size: usize,
-    /// Adam's step size for the policy. Default 3e-4.
+    /// Adam's step size for the policy, in (0, 1]. Default 3e-4.
     pub policy_learning_rate: f64,
-    /// Adam's step size for the critic. Default 3e-4.
+    /// Adam's step size for the critic, in (0, 1]. Default 3e-4.
     pub critic_learning_rate: f64,
-    /// Discount per control period, γ. Default 0.99.
+    /// Discount γ per control period, in [0, 1). Default 0.99.
     pub discount: f64,
-    /// Share of policy and critic that moves into the target networks when the policy is updated, τ. Default 0.005.
+    /// Share τ of policy and critic that moves into the target networks at each policy update, in
+    /// (0, 1]. Default 0.005.
     pub target_rate: f64,
-    /// Standard deviation of the noise added to actions in training flights, each command in [-1, 1]. Default 0.1, as in arXiv:1802.09477.
+    /// Standard deviation of the exploration noise in training episodes, on commands in [-1, 1]; 0
+    /// to 2. Default 0.1, as in arXiv:1802.09477.
     pub exploration_noise: f64,
-    /// Standard deviation of the noise that smooths the targets. Default 0.2, as in arXiv:1802.09477.
+    /// Standard deviation of the noise that smooths the targets, 0 to 2. Default 0.2, as in
+    /// arXiv:1802.09477.
     pub target_noise: f64,
-    /// Bound of that noise. Default 0.5, as in arXiv:1802.09477.
+    /// Bound of the target noise, 0 to 2. Default 0.5, as in arXiv:1802.09477.
     pub target_noise_bound: f64,
-    /// Updates of the critic for each of the policy. Default 2, as in arXiv:1802.09477.
+    /// Critic updates per policy update, at least 1. Default 2, as in arXiv:1802.09477.
     pub policy_period: u64,
 }
 
@@ -56,7 +64,7 @@ impl Default for Td3Section {
 }
 
 impl Td3Section {
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require_width("td3.hidden_width", self.hidden_width)?;
         require_critic_networks("td3.critic_networks", self.critic_networks)?;
         require_batch_size("td3.batch_size", self.batch_size)?;

@@ -1,26 +1,31 @@
-//! `[transport]`.
+//! The `[transport]` section.
 
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Invalid, require};
+use super::{InvalidValue, require};
 
-/// `[transport]`: limits and deadlines between the processes. Nothing here influences what is learned.
+/// The `[transport]` section: limits and deadlines between the processes. Nothing here influences
+/// learning.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransportSection {
-    /// Actors that may be attached at one time. Default 64.
+    /// Most actors attached at one time, 1 to 1024. Default 64.
     pub max_actors: usize,
-    /// Records of the longest possible flight: its steps and the closing record. Bounds the shared memory of an actor, 9.4 KiB a record. Default 256.
-    pub max_records_per_flight: usize,
-    /// Tickets an actor holds at one time; 2 keep it busy while the learner takes a flight in. Default 2.
+    /// Records of the longest possible episode, its steps and the closing record; 2 to 65,536. It
+    /// bounds the shared memory of an actor, 9.4 KiB a record. Default 256.
+    pub max_records_per_episode: usize,
+    /// Tickets an actor holds at one time, 1 to 16. With 2 it stays busy while the learner commits
+    /// an episode. Default 2.
     pub tickets_per_actor: usize,
-    /// Seconds without a record or a sign of life after which an actor's tickets are issued again. Default 5.
+    /// Seconds without a record or a heartbeat after which an actor's tickets are issued again, 0.1
+    /// to 86,400. Default 5.
     pub actor_silence_secs: f64,
-    /// Seconds a ticket may take before it is issued again. Default 60.
-    pub flight_deadline_secs: f64,
-    /// Seconds without a sign of life from the learner after which an actor gives up. Default 30.
+    /// Seconds after which an unfinished ticket is issued again, 0.1 to 86,400. Default 60.
+    pub episode_deadline_secs: f64,
+    /// Seconds without a heartbeat from the learner after which an actor exits, 0.1 to 86,400.
+    /// Default 30.
     pub learner_silence_secs: f64,
 }
 
@@ -28,23 +33,25 @@ impl Default for TransportSection {
     fn default() -> Self {
         Self {
             max_actors: 64,
-            max_records_per_flight: 256,
+            max_records_per_episode: 256,
             tickets_per_actor: 2,
             actor_silence_secs: 5.0,
-            flight_deadline_secs: 60.0,
+            episode_deadline_secs: 60.0,
             learner_silence_secs: 30.0,
         }
     }
 }
 
 impl TransportSection {
-    /// Interval of the signs of life that both sides give, well below either silence limit, and at most two seconds: all that is done at times is done
-    /// at heartbeats.
+    /// Returns the interval of the heartbeats of both sides: well below either silence limit, and
+    /// at most two seconds, because all periodic work is done at heartbeats.
     pub fn heartbeat(&self) -> Duration {
-        Duration::from_secs_f64((self.actor_silence_secs.min(self.learner_silence_secs) / 8.0).min(2.0))
+        Duration::from_secs_f64(
+            (self.actor_silence_secs.min(self.learner_silence_secs) / 8.0).min(2.0),
+        )
     }
 
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
             (1..=1024).contains(&self.max_actors),
             "transport.max_actors",
@@ -52,27 +59,31 @@ impl TransportSection {
             "is outside 1..=1024: each actor takes a slot in every shared-memory service",
         )?;
         require(
-            (2..=65_536).contains(&self.max_records_per_flight),
-            "transport.max_records_per_flight",
-            self.max_records_per_flight,
-            "is outside 2..=65536: a flight has at least one step and its closing record",
+            (2..=65_536).contains(&self.max_records_per_episode),
+            "transport.max_records_per_episode",
+            self.max_records_per_episode,
+            "is outside 2..=65536: an episode has at least one step and its closing record",
         )?;
         require(
             (1..=16).contains(&self.tickets_per_actor),
             "transport.tickets_per_actor",
             self.tickets_per_actor,
-            "is outside 1..=16: the subscriber's buffer holds as many whole flights of every actor",
+            "is outside 1..=16: the subscriber's buffer holds as many whole episodes of every \
+            actor",
         )?;
         for (key, secs) in [
             ("transport.actor_silence_secs", self.actor_silence_secs),
-            ("transport.flight_deadline_secs", self.flight_deadline_secs),
+            (
+                "transport.episode_deadline_secs",
+                self.episode_deadline_secs,
+            ),
             ("transport.learner_silence_secs", self.learner_silence_secs),
         ] {
             require(
                 (0.1..=86_400.0).contains(&secs),
                 key,
                 secs,
-                "is outside [0.1, 86400]: a peer would be given up at once, or never",
+                "is outside [0.1, 86400]: a silent peer would be dropped at once, or never",
             )?;
         }
         Ok(())

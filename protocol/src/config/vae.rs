@@ -1,40 +1,41 @@
-//! `[vae]`.
-
-use std::fmt;
+//! The `[vae]` section.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Engine, Invalid, RunSection, require, require_learning_rate};
-use crate::LONGEST_LATENT;
+use super::{Engine, InvalidValue, RunSection, require, require_learning_rate};
+use crate::MAX_LATENT;
 
-/// Lengths a latent code may have. Records have room for the longest; mean and log-variance of the shortest fill the 16 lanes that the learner adds up at a time.
-const LATENTS: [usize; 4] = [8, 16, 32, LONGEST_LATENT];
+/// Allowed lengths of the latent code. Records have room for the longest; mean and log-variance of
+/// the shortest fill the 16 lanes that the learner sums at a time.
+const LATENTS: [usize; 4] = [8, 16, 32, MAX_LATENT];
 
-/// `[vae]`: the variational auto-encoder (paper, section 3.3), trained together with the agent and then frozen.
+/// The `[vae]` section: the variational auto-encoder (paper, section 3.3), trained together with
+/// the agent and then frozen.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VaeSection {
-    /// Length of the latent code: 8, 16, 32 or 64 (paper: 32). Default 32.
+    /// Length of the latent code: 8, 16, 32 or 64. Default 32, as in the paper.
     pub latent: usize,
-    /// Environment steps during which the VAE is trained; then it is frozen and stored latents are recomputed (paper: 10000). Default 10000.
+    /// Environment steps during which the VAE is trained, 1 to 200,000. Then it is frozen and
+    /// stored latent codes are recomputed. Default 10000, as in the paper.
     pub train_steps: usize,
-    /// Environment steps after which stored latents are recomputed while the VAE is still trained, so that a policy that learns meanwhile learns from codes of one
-    /// encoder. 0 recomputes them only when it is frozen, as in the paper. Default 0.
+    /// Environment steps after which stored latent codes are recomputed while the VAE is still
+    /// trained, so that a policy that learns meanwhile sees the codes of one encoder. 0 recomputes
+    /// them only when the VAE is frozen, as in the paper. Default 0.
     pub recode_steps: usize,
-    /// VAE steps per environment step, done at the end of the epoch. Default 0.1.
+    /// VAE updates per environment step, done at the end of the epoch; in (0, 10]. Default 0.1.
     pub updates_per_step: f64,
-    /// Depth images in a minibatch. Default 32.
+    /// Depth images in a minibatch, 1 to 4096. Default 32.
     pub batch_size: usize,
-    /// Adam's step size. Default 1e-3.
+    /// Adam's step size, in (0, 1]. Default 1e-3.
     pub learning_rate: f64,
-    /// Weight of the Kullback-Leibler term against the squared error summed over the image's pixels. Default 1, the plain VAE.
+    /// Weight of the Kullback-Leibler term against the squared error summed over the image's
+    /// pixels, at least 0. Default 1, the plain VAE.
     pub kl_weight: f64,
-    /// What reproduces the image, in training alone: `plain`, or `u-net`, which sees the encoder's feature maps beside the code (arXiv:1505.04597). The encoder that flies is the
-    /// same. A U-Net is trained on libtorch, whatever trains the policy. Default `plain`, as in the paper.
+    /// Decoder, used in training only: `plain`, or `u-net`, which also sees the encoder's feature
+    /// maps (arXiv:1505.04597). The flown encoder is the same. A U-Net is always trained on
+    /// libtorch. Default `plain`, as in the paper.
     pub decoder: DecoderName,
-    /// In what precision depth images are encoded: `f32` or `bf16`. Part of the result. AVX-512's instruction for bfloat16 is used where it is, AMX never: AMD's Zen 4
-    /// encodes nearly twice as fast with it, Intel's Sapphire and Emerald Rapids more slowly than in `f32`; all processors get the same numbers (those below 1.2e-38 apart). The VAE is trained in `f32` either way. Default `f32`.
-    pub encoder_precision: Precision,
 }
 
 impl Default for VaeSection {
@@ -48,13 +49,13 @@ impl Default for VaeSection {
             learning_rate: 1e-3,
             kl_weight: 1.0,
             decoder: DecoderName::Plain,
-            encoder_precision: Precision::F32,
         }
     }
 }
 
 impl VaeSection {
-    /// What computes it in a run with these settings: the run's engine, but a U-Net is written for libtorch alone.
+    /// Returns the engine of the VAE with these settings: the run's engine, except that a U-Net
+    /// exists for libtorch only.
     pub fn engine(&self, run: &RunSection) -> Engine {
         match self.decoder {
             DecoderName::Plain => run.engine(),
@@ -62,13 +63,14 @@ impl VaeSection {
         }
     }
 
-    pub(super) fn validate(&self) -> Result<(), Invalid> {
+    pub(super) fn validate(&self) -> Result<(), InvalidValue> {
         require(
             LATENTS.contains(&self.latent),
             "vae.latent",
             self.latent,
             format!(
-                "is none of {LATENTS:?}: no record and no network is laid out for such a code; set it to one of them, of which the paper has 32"
+                "is not one of {LATENTS:?}: records and networks have no layout for such a code; \
+                set it to one of them (paper: 32)"
             ),
         )?;
         require(
@@ -81,7 +83,7 @@ impl VaeSection {
             self.train_steps <= 200_000,
             "vae.train_steps",
             self.train_steps,
-            "is above 200000: every depth image of these steps is held in memory, 9 KiB each",
+            "is above 200000: the depth images of all these steps are kept in memory, 9 KiB each",
         )?;
         require(
             self.updates_per_step > 0.0 && self.updates_per_step <= 10.0,
@@ -105,7 +107,7 @@ impl VaeSection {
     }
 }
 
-/// What the decoder sees.
+/// Input of the decoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum DecoderName {
@@ -113,23 +115,4 @@ pub enum DecoderName {
     Plain,
     /// The code, and the encoder's feature maps.
     UNet,
-}
-
-/// Precision of what is multiplied; sums are f32.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// 24 bits.
-    F32,
-    /// bfloat16, 8 bits.
-    Bf16,
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::F32 => "f32",
-            Self::Bf16 => "bf16",
-        })
-    }
 }

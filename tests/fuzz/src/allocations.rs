@@ -1,48 +1,53 @@
-//! Holds readers to bounded memory: no input is large, so no single allocation has a reason to be.
+//! Checks that readers use bounded memory. Inputs are small, so no single allocation may be large.
 //!
-//! A length that a reader believes before it has seen as many bytes shows here, whether or not the system would have granted the memory.
+//! A reader that trusts a stated length before it has read as many bytes fails here, even if the
+//! system would have granted the memory.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-/// Most bytes that may be asked for at once: the largest snapshot and its mesh stay far below.
+/// Largest allowed allocation, in bytes. The largest snapshot and its mesh stay far below.
 pub const LARGEST_ALLOCATION: usize = 64 << 20;
 
 thread_local! {
-    /// The largest allocation of this thread since [`forget`] was called, in bytes.
+    /// Largest allocation of this thread since [`forget`] was called, in bytes.
     static LARGEST: Cell<usize> = const { Cell::new(0) };
 }
 
-/// Forgets what this thread allocated so far.
+/// Resets the record of this thread's allocations.
 pub fn forget() {
     LARGEST.set(0);
 }
 
-/// Panics if this thread asked for more than [`LARGEST_ALLOCATION`] at once since [`forget`].
+/// Panics if this thread has requested more than [`LARGEST_ALLOCATION`] at once since [`forget`].
 ///
 /// # Panics
-/// So that it is reported like any other broken promise.
+/// Panics so that the violation is reported like any other.
 pub fn check() {
     let largest = LARGEST.get();
-    assert!(largest <= LARGEST_ALLOCATION, "{largest} bytes were allocated at once");
+    assert!(
+        largest <= LARGEST_ALLOCATION,
+        "{largest} bytes were allocated at once"
+    );
 }
 
 fn note(bytes: usize) {
-    // Plain data that needs no destructor: there from the first to the last moment of a thread.
+    // Plain data without destructor is accessible during the whole lifetime of a thread.
     LARGEST.set(LARGEST.get().max(bytes));
 }
 
-/// The system's allocator, watched.
+/// The system's allocator with a record of the largest request.
 struct Watched;
 
 #[global_allocator]
 static ALLOCATOR: Watched = Watched;
 
-// SAFETY: every call goes to the system's allocator unchanged; noting a number allocates nothing.
+// SAFETY: every call goes to the system's allocator unchanged; recording a number allocates
+// nothing.
 unsafe impl GlobalAlloc for Watched {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         note(layout.size());
-        // SAFETY: the caller's promises are the system allocator's.
+        // SAFETY: the caller gives the guarantees that the system allocator requires.
         unsafe { System.alloc(layout) }
     }
 

@@ -1,4 +1,5 @@
-//! Inputs that are kept: found by the long run because they reach what no sample reaches, or because they once broke something.
+//! Inputs worth keeping: found by long fuzzing because they reach what no sample reaches, or
+//! because they once violated a guarantee.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -6,10 +7,11 @@ use std::path::Path;
 
 use crate::targets::Target;
 
-/// The files in `corpus/<target>/` and `regressions/<target>/` of this package, with their names, in order.
+/// Returns the files in `corpus/<target>/` and `regressions/<target>/` of this package, with their
+/// names, in order.
 ///
 /// # Panics
-/// When they cannot be read.
+/// Panics if they cannot be read.
 pub fn committed(target: &Target) -> Vec<(String, Vec<u8>)> {
     let package = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut found = Vec::new();
@@ -27,7 +29,8 @@ pub fn committed(target: &Target) -> Vec<(String, Vec<u8>)> {
     found
 }
 
-/// Words and numbers in the printable samples of `target`: what its reader's grammar is made of.
+/// Returns the words and numbers in the printable samples of a target: the vocabulary of its
+/// grammar.
 pub fn word_list(samples: &[Vec<u8>]) -> Vec<Vec<u8>> {
     let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"_.+-".contains(byte);
     let words: BTreeSet<Vec<u8>> = samples

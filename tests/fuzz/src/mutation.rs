@@ -1,8 +1,8 @@
-//! Turns one input into another: bits, bytes, pieces, words and numbers changed.
+//! Mutates an input: bits, bytes, pieces, words and numbers.
 
 use rand::{Rng, RngExt};
 
-/// What stands where a number or a word stood.
+/// Replacements for a number or a word.
 const NASTY: [&str; 30] = [
     "nan",
     "-nan",
@@ -36,8 +36,14 @@ const NASTY: [&str; 30] = [
     "1979-05-27",
 ];
 
-/// Changes `bytes` in one to eight ways. `words` are put in here and there, and pieces of `other`.
-pub fn mutate(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], limit_bytes: usize, rng: &mut impl Rng) {
+/// Changes `bytes` in one to eight ways. Inserts some of `words`, and pieces of `other`.
+pub fn mutate(
+    bytes: &mut Vec<u8>,
+    other: &[u8],
+    words: &[Vec<u8>],
+    limit_bytes: usize,
+    rng: &mut impl Rng,
+) {
     for _ in 0..1 + rng.random_range(0..8_u32) * u32::from(rng.random::<bool>()) {
         change(bytes, other, words, rng);
     }
@@ -55,8 +61,16 @@ fn change(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], rng: &mut impl R
         0 => bytes[at] ^= 1 << rng.random_range(0..8_u32),
         1 => bytes[at] = rng.random(),
         2 => {
-            let value: u64 =
-                [0, 1, u64::MAX, u64::MAX >> 1, 1 << 63, 1 << 31, 1 << 32, 255][rng.random_range(0..8_usize)];
+            let value: u64 = [
+                0,
+                1,
+                u64::MAX,
+                u64::MAX >> 1,
+                1 << 63,
+                1 << 31,
+                1 << 32,
+                255,
+            ][rng.random_range(0..8_usize)];
             let width = [1, 2, 4, 8][rng.random_range(0..4_usize)].min(bytes.len() - at);
             bytes[at..at + width].copy_from_slice(&value.to_le_bytes()[..width]);
         }
@@ -79,7 +93,11 @@ fn change(bytes: &mut Vec<u8>, other: &[u8], words: &[Vec<u8>], rng: &mut impl R
         }
         8 => {
             let word = token(bytes, at);
-            replace(bytes, word, NASTY[rng.random_range(0..NASTY.len())].as_bytes());
+            replace(
+                bytes,
+                word,
+                NASTY[rng.random_range(0..NASTY.len())].as_bytes(),
+            );
         }
         _ => bytes.truncate(at),
     }
@@ -89,7 +107,7 @@ fn replace(bytes: &mut Vec<u8>, range: std::ops::Range<usize>, by: &[u8]) {
     bytes.splice(range, by.iter().copied());
 }
 
-/// A piece of `bytes`, mostly a short one.
+/// Returns a piece of `bytes`, mostly a short one.
 fn piece<'a>(bytes: &'a [u8], rng: &mut impl Rng) -> &'a [u8] {
     let start = rng.random_range(0..=bytes.len());
     let longest = (bytes.len() - start).min(if rng.random_range(0..4_u32) == 0 {
@@ -100,10 +118,14 @@ fn piece<'a>(bytes: &'a [u8], rng: &mut impl Rng) -> &'a [u8] {
     &bytes[start..start + rng.random_range(0..=longest)]
 }
 
-/// The word or number about `at`.
+/// Returns the word or number around `at`.
 fn token(bytes: &[u8], at: usize) -> std::ops::Range<usize> {
     let is_part = |byte: &u8| byte.is_ascii_alphanumeric() || b"_.+-".contains(byte);
-    let before = bytes[..at].iter().rev().take_while(|byte| is_part(byte)).count();
+    let before = bytes[..at]
+        .iter()
+        .rev()
+        .take_while(|byte| is_part(byte))
+        .count();
     let after = bytes[at..].iter().take_while(|byte| is_part(byte)).count();
     at - before..at + after
 }

@@ -1,4 +1,5 @@
-//! Folders for readers that take files only, in memory where the machine has it: thousands of files a second are no load for a disk.
+//! Folders for readers that only accept files, in memory where possible: thousands of files per
+//! second would burden a disk.
 
 use std::fs;
 use std::path::Path;
@@ -9,7 +10,8 @@ thread_local! {
     static FOLDER: TempDir = folder();
 }
 
-/// An empty folder that is removed with the value. `launch/fuzz.sh`, whose processes end without a word, names one of its own to remove.
+/// Creates an empty folder that is removed with the value. Processes of `tests/fuzz.sh` may end
+/// without removing theirs, so the script names a folder of its own and removes that.
 pub(crate) fn folder() -> TempDir {
     let memory = Path::new("/dev/shm");
     if std::env::var_os("TMPDIR").is_none() && memory.is_dir() {
@@ -19,7 +21,8 @@ pub(crate) fn folder() -> TempDir {
     }
 }
 
-/// Calls `read` with the thread's folder, in which `files` lie and nothing else that an earlier call did not put there under another name.
+/// Calls `read` with the thread's folder, which contains `files`. Other files of earlier calls may
+/// remain under other names.
 pub(crate) fn with_files<T>(files: &[(&str, &[u8])], read: impl FnOnce(&Path) -> T) -> T {
     FOLDER.with(|folder| {
         for (name, bytes) in files {
@@ -27,7 +30,7 @@ pub(crate) fn with_files<T>(files: &[(&str, &[u8])], read: impl FnOnce(&Path) ->
         }
         let result = read(folder.path());
         for (name, _) in files {
-            // A reader may have replaced or removed what it was given.
+            // A reader may have replaced or removed its input.
             let _ = fs::remove_file(folder.path().join(name));
         }
         result

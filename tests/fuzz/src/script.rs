@@ -1,6 +1,7 @@
-//! Reads an input as a sequence of choices, for targets that build what bytes alone would hardly ever spell.
+//! Reads an input as a sequence of choices, for targets that build inputs which random bytes would
+//! hardly ever form.
 
-/// The rest of an input. When it is used up every choice is zero, so that any bytes are a script.
+/// Rest of an input. Once it is used up every choice is zero, so that any bytes are a script.
 pub(crate) struct Script<'a>(&'a [u8]);
 
 impl<'a> Script<'a> {
@@ -12,7 +13,7 @@ impl<'a> Script<'a> {
         self.0.is_empty()
     }
 
-    /// The next `count` bytes, or as many as are left.
+    /// Returns the next `count` bytes, or as many as are left.
     pub(crate) fn bytes(&mut self, count: usize) -> &'a [u8] {
         let (taken, rest) = self.0.split_at(count.min(self.0.len()));
         self.0 = rest;
@@ -42,12 +43,13 @@ impl<'a> Script<'a> {
         u64::from_le_bytes(self.array())
     }
 
-    /// A value of `choices`.
+    /// Returns one of `choices`.
     pub(crate) fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
         choices[usize::from(self.u8()) % choices.len()]
     }
 
-    /// Mostly a number from `usual`, in 65536 steps; sometimes any float there is, and sometimes one that is known for making trouble.
+    /// Returns mostly a number from `usual`, in 65536 steps; sometimes any float, and sometimes a
+    /// notorious one.
     pub(crate) fn number(&mut self, usual: std::ops::RangeInclusive<f32>) -> f32 {
         const TROUBLE: [f32; 12] = [
             0.0,

@@ -1,36 +1,38 @@
-//! Which vector instructions images are drawn with, chosen once at run time.
+//! Vector instruction sets for drawing images, chosen once at run time.
 
 use std::fmt;
 
-use super::{DepthCamera, Errors, IMAGE_PIXELS, draw, settings};
+use super::{DepthCamera, IMAGE_PIXELS, ImageErrors, draw, settings};
 
-/// [`draw`], compiled for some instructions.
-pub(super) type Draw = fn(&mut DepthCamera, &settings::View, Errors, &mut [u8; IMAGE_PIXELS]);
+/// [`draw`], compiled for an instruction set.
+pub(super) type DrawFunction =
+    fn(&mut DepthCamera, &settings::CameraView, ImageErrors, &mut [u8; IMAGE_PIXELS]);
 
-/// A set of vector instructions that drawing is compiled for.
+/// A vector instruction set for which drawing is compiled.
 ///
-/// The same arithmetic in the same order whichever is chosen: wider registers do not change a bit of the image.
+/// All of them do the same arithmetic in the same order: wider registers change no bit of the
+/// image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Instructions {
-    /// Those that every processor has.
+pub enum InstructionSet {
+    /// The instructions that every processor has.
     Portable,
-    /// 256 bits.
+    /// AVX2, 256 bits.
     Avx2,
-    /// 512 bits: AVX-512 F, BW, DQ and VL.
+    /// AVX-512 F, BW, DQ and VL, 512 bits.
     Avx512,
 }
 
-impl Instructions {
-    /// All of them, the widest last.
+impl InstructionSet {
+    /// All instruction sets, the widest last.
     pub const ALL: [Self; 3] = [Self::Portable, Self::Avx2, Self::Avx512];
 
-    /// The widest that this machine has, with which every camera draws.
+    /// Returns the widest set of this machine, which every camera uses.
     pub fn best() -> Self {
         let mut all = Self::ALL.into_iter().rev();
         all.find(|set| set.is_available()).unwrap_or(Self::Portable)
     }
 
-    /// Whether this machine has them.
+    /// Returns `true` if this machine has the set.
     pub fn is_available(self) -> bool {
         match self {
             Self::Portable => true,
@@ -48,22 +50,23 @@ impl Instructions {
         }
     }
 
-    /// How to draw with them.
+    /// Returns the drawing function for this set.
     ///
     /// # Panics
-    /// When this machine does not have them.
-    pub(super) fn draw(self) -> Draw {
+    /// If this machine does not have the set.
+    pub(super) fn draw(self) -> DrawFunction {
         assert!(self.is_available(), "this machine has no {self}");
         match self {
             Self::Portable => draw,
             #[cfg(target_arch = "x86_64")]
             Self::Avx2 => {
-                // SAFETY: the machine has the features that the function is compiled for, as just asked.
+                // SAFETY: the assertion above checked that the machine has the features for which
+                // the function is compiled.
                 |camera, view, errors, image| unsafe { draw_avx2(camera, view, errors, image) }
             }
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => {
-                // SAFETY: as above.
+                // SAFETY: the same assertion holds.
                 |camera, view, errors, image| unsafe { draw_avx512(camera, view, errors, image) }
             }
             #[cfg(not(target_arch = "x86_64"))]
@@ -72,7 +75,7 @@ impl Instructions {
     }
 }
 
-impl fmt::Display for Instructions {
+impl fmt::Display for InstructionSet {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Portable => "portable",
@@ -84,12 +87,22 @@ impl fmt::Display for Instructions {
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn draw_avx512(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw_avx512(
+    camera: &mut DepthCamera,
+    view: &settings::CameraView,
+    errors: ImageErrors,
+    image: &mut [u8; IMAGE_PIXELS],
+) {
     draw(camera, view, errors, image);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn draw_avx2(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw_avx2(
+    camera: &mut DepthCamera,
+    view: &settings::CameraView,
+    errors: ImageErrors,
+    image: &mut [u8; IMAGE_PIXELS],
+) {
     draw(camera, view, errors, image);
 }

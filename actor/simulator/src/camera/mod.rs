@@ -1,8 +1,9 @@
-//! The depth camera: what the drone sees of a course.
+//! The depth camera.
 //!
-//! The image is the planar depth (along the optical axis, not along the ray) in 8 bits. It is drawn, not traced: every surface
-//! of a course is flat, so a frame costs some hundred edges and a few thousand vector operations. The
-//! [`reference`](ReferenceCamera) traces the same surfaces ray by ray; a property test holds the two together.
+//! The image is the planar depth (along the optical axis, not along the ray) in 8 bits. It is
+//! drawn, not traced: every surface of a course is flat, so a frame costs some hundred edges and a
+//! few thousand vector operations. [`ReferenceCamera`] traces the same surfaces ray by ray; a
+//! property test compares the two.
 
 mod canvas;
 mod instructions;
@@ -12,7 +13,7 @@ mod scene;
 mod settings;
 
 #[cfg(test)]
-mod agreement;
+mod agreement_tests;
 #[cfg(test)]
 mod noise_tests;
 
@@ -21,9 +22,9 @@ use nalgebra::Isometry3;
 use crate::course::Course;
 use crate::disturbances::DepthNoiseSettings;
 
-pub use instructions::Instructions;
+pub use instructions::InstructionSet;
 pub use reference::ReferenceCamera;
-pub use settings::{CameraFault, CameraSettings};
+pub use settings::{CameraSettings, CameraSettingsError};
 
 /// Columns of the depth image.
 pub const IMAGE_WIDTH: usize = 128;
@@ -31,72 +32,86 @@ pub const IMAGE_WIDTH: usize = 128;
 /// Rows of the depth image.
 pub const IMAGE_HEIGHT: usize = 72;
 
-/// Pixels of the depth image, a byte each: row by row from the top, each from the left.
+/// Pixels of the depth image, one byte each: row by row from the top, each row from the left.
 pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
 
-/// Draws depth images of one course. Holds its scratch memory: drawing allocates nothing.
+/// Depth camera in one course. It keeps its scratch memory, so drawing allocates nothing.
 pub struct DepthCamera {
     settings: CameraSettings,
     scene: scene::Scene,
-    canvas: canvas::Canvas,
+    canvas: canvas::DepthCanvas,
     noise: Option<noise::StereoNoise>,
-    draw: instructions::Draw,
+    draw: instructions::DrawFunction,
 }
 
-/// Which errors an image has.
+/// Errors drawn into an image.
 #[derive(Clone, Copy)]
-enum Errors {
+enum ImageErrors {
     None,
-    /// Those of this key.
+    /// The errors that belong to this key.
     OfKey(u64),
 }
 
 impl DepthCamera {
-    /// A camera in this course.
+    /// Builds a camera in this course.
     ///
     /// # Errors
-    /// [`CameraFault`] if the settings make no sense.
-    pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, CameraFault> {
-        settings.check()?;
+    /// [`CameraSettingsError`] if a setting is out of bounds.
+    pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, CameraSettingsError> {
+        settings.validate()?;
         Ok(Self {
             settings: settings.clone(),
             scene: scene::Scene::new(&course.mesh()),
-            canvas: canvas::Canvas::new(),
+            canvas: canvas::DepthCanvas::new(),
             noise: None,
-            draw: Instructions::best().draw(),
+            draw: InstructionSet::best().draw(),
         })
     }
 
-    /// The same camera with errors as a real one has them, in what [`DepthCamera::render_with_noise`] draws.
+    /// Returns the same camera, with these errors in the images of
+    /// [`DepthCamera::render_with_noise`].
     #[must_use]
     pub fn with_noise(mut self, settings: &DepthNoiseSettings) -> Self {
         self.noise = noise::StereoNoise::new(settings, &self.settings);
         self
     }
 
-    /// Draws what the camera sees with the body at `world_from_body`, straight into `image`.
+    /// Draws the depth image into `image`, with the body at `world_from_body`.
     ///
-    /// A pixel is `round(255 * min(depth / range, 1))`, so larger is farther. Every pixel is written. Surfaces nearer than
-    /// `near_m` and the backs of surfaces (from inside a wall) are not seen. A pose that is not a number
-    /// sees nothing: all 255.
+    /// A pixel is `round(255 * min(depth / range, 1))`, so larger is farther. Every pixel is
+    /// written. Surfaces nearer than `near_m` and the backs of surfaces (from inside a wall) are
+    /// invisible. If the pose is NaN, every pixel is 255.
     pub fn render(&mut self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
         let view = self.settings.view(world_from_body);
-        (self.draw)(self, &view, Errors::None, image);
+        (self.draw)(self, &view, ImageErrors::None, image);
     }
 
-    /// Draws the same with the camera's errors, if it has any. The same `key`, pose and settings give the same ones; see [`DepthNoiseSettings`].
-    pub fn render_with_noise(&mut self, world_from_body: &Isometry3<f32>, key: u64, image: &mut [u8; IMAGE_PIXELS]) {
+    /// Draws the same image with the camera's errors, if it has any; see [`DepthNoiseSettings`].
+    /// The same `key`, pose and settings give the same errors.
+    pub fn render_with_noise(
+        &mut self,
+        world_from_body: &Isometry3<f32>,
+        key: u64,
+        image: &mut [u8; IMAGE_PIXELS],
+    ) {
         let view = self.settings.view(world_from_body);
-        (self.draw)(self, &view, Errors::OfKey(key), image);
+        (self.draw)(self, &view, ImageErrors::OfKey(key), image);
     }
 }
 
 #[inline(always)]
-fn draw(camera: &mut DepthCamera, view: &settings::View, errors: Errors, image: &mut [u8; IMAGE_PIXELS]) {
+fn draw(
+    camera: &mut DepthCamera,
+    view: &settings::CameraView,
+    errors: ImageErrors,
+    image: &mut [u8; IMAGE_PIXELS],
+) {
     camera.canvas.clear();
-    camera.scene.draw(&camera.settings, view, &mut camera.canvas);
+    camera
+        .scene
+        .draw(&camera.settings, view, &mut camera.canvas);
     match (errors, &camera.noise) {
-        (Errors::OfKey(key), Some(noise)) => noise.write(camera.canvas.nearness(), key, image),
+        (ImageErrors::OfKey(key), Some(noise)) => noise.write(camera.canvas.nearness(), key, image),
         _ => camera.canvas.write(image),
     }
 }

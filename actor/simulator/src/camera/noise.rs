@@ -1,7 +1,8 @@
-//! What a stereo camera makes of the scene: noise that grows with depth, shadows beside near objects, patches without a reading.
+//! Errors of a stereo camera: noise that grows with depth, shadows beside near objects, patches
+//! without a reading.
 //!
-//! A pixel's noise is computed from its number and the image's key, many pixels at a time; shadows and patches touch few pixels. All of it together costs
-//! less than drawing the scene.
+//! A pixel's noise is computed from its number and the image's key, many pixels at a time. Shadows
+//! and patches affect few pixels. All errors together cost less than drawing the scene.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -10,29 +11,31 @@ use super::canvas::rounded;
 use super::{CameraSettings, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 use crate::disturbances::{DepthModel, DepthNoiseSettings, mix, scrambled, standard_normal};
 
-/// A pixel without a reading.
+/// Grey level of a pixel without a reading.
 pub(super) const NO_READING: u8 = 0;
 
-/// The nearest reading: what has one is never taken for what has none.
+/// Least grey level of a reading, so that it differs from [`NO_READING`].
 const NEAREST_READING: f32 = 1.0;
 
-/// Widest shadow, pixels: that of an object 0.2 m away, nearer than which no stereo camera of this kind matches anything.
+/// Widest shadow, pixels: that of an object 0.2 m away. A stereo camera of this kind matches
+/// nothing nearer.
 const WIDEST_SHADOW_PX: usize = 16;
 
-/// Everything of [`DepthNoiseSettings`] that a pixel needs, in its units.
+/// [`DepthNoiseSettings`] converted to pixels and grey levels.
 #[derive(Debug, Clone)]
 pub(super) struct StereoNoise {
-    /// σ in grey levels as a polynomial of the grey level: quadratic, linear, constant.
+    /// Coefficients of σ in grey levels as a polynomial of the grey level: quadratic, linear,
+    /// constant.
     sigma: [f32; 3],
-    /// Disparity in pixels of what lies at the range.
+    /// Disparity of a point at the range, pixels.
     disparity_px: f32,
-    /// Expected number of patches.
+    /// Expected number of patches in an image.
     patches: f32,
     largest_patch_px: usize,
 }
 
 impl StereoNoise {
-    /// `None` if the image shall be true.
+    /// Returns `None` if the model is off.
     pub(super) fn new(settings: &DepthNoiseSettings, camera: &CameraSettings) -> Option<Self> {
         if settings.model == DepthModel::Off {
             return None;
@@ -51,7 +54,8 @@ impl StereoNoise {
         })
     }
 
-    /// Grey levels of what is seen with errors. `nearness`: range over depth, `[72, 128]`, 1 at the range or farther. `key`: another one, other errors.
+    /// Writes the image with errors as grey levels. `nearness`: range over depth, `[72, 128]`, 1 at
+    /// the range or farther. Different values of `key` give different errors.
     #[inline(always)]
     pub(super) fn write(
         &self,
@@ -68,12 +72,18 @@ impl StereoNoise {
         self.drop_patches(key, image);
     }
 
-    /// Noise of one row, the first pixel of which is number `first` of the image.
+    /// Writes a row with noise. `first`: number of the row's first pixel in the image.
     #[inline(always)]
-    fn write_row(&self, nearness: &[f32; IMAGE_WIDTH], first: u32, key: u64, pixels: &mut [u8; IMAGE_WIDTH]) {
+    fn write_row(
+        &self,
+        nearness: &[f32; IMAGE_WIDTH],
+        first: u32,
+        key: u64,
+        pixels: &mut [u8; IMAGE_WIDTH],
+    ) {
         let [quadratic, linear, constant] = self.sigma;
         let (low_key, high_key) = (key as u32, (key >> 32) as u32);
-        // Loops over arrays of one length, so that they are done in registers full of pixels.
+        // All arrays have one length, so that the compiler vectorises the loops.
         let mut normals = [0.0; IMAGE_WIDTH];
         for (column, normal) in normals.iter_mut().enumerate() {
             let low = mix((first + column as u32) ^ low_key);
@@ -82,16 +92,18 @@ impl StereoNoise {
         for ((pixel, nearness), normal) in pixels.iter_mut().zip(nearness).zip(&normals) {
             let level = 255.0 / nearness;
             let sigma = (quadratic * level + linear) * level + constant;
-            // What is out of range has no depth to be wrong about.
+            // A surface out of range has no depth, so it has no error.
             let sigma = if *nearness > 1.0 { sigma } else { 0.0 };
             *pixel = rounded((level + sigma * normal).clamp(NEAREST_READING, 255.0));
         }
     }
 
-    /// Takes the readings from what the left lens sees and the right one does not.
+    /// Removes the readings of points that only the left lens sees.
     ///
-    /// A point `disparity` pixels farther left in the right image is hidden there when a nearer one, k pixels to its right, lands on it or left of it: when
-    /// the disparity grows by k within k pixels. Half a pixel less, so that a shadow's width is rounded and not cut.
+    /// A point lies `disparity` pixels farther left in the right image. It is hidden there if a
+    /// nearer point, k pixels to its right, lands on it or left of it: if the disparity grows by k
+    /// within k pixels. The test uses half a pixel less, so that a shadow's width is rounded and
+    /// not truncated.
     #[inline(always)]
     fn shade_row(&self, nearness: &[f32; IMAGE_WIDTH], pixels: &mut [u8; IMAGE_WIDTH]) {
         let nearest = nearness.iter().copied().fold(1.0, f32::max);
@@ -100,14 +112,17 @@ impl StereoNoise {
         if reach_px == 0 {
             return;
         }
-        // By how many pixels each is hidden; beyond the left edge of the right image everything is.
+        // Pixels by which each point is hidden. Points beyond the right image's left edge are.
         let mut hidden_px = [0.0f32; IMAGE_WIDTH];
         for (column, (hidden, nearness)) in hidden_px.iter_mut().zip(nearness).enumerate() {
             *hidden = nearness * self.disparity_px - (column as f32 + 0.5);
         }
         for k in 1..=reach_px {
             let within = k as f32 - 0.5;
-            for (hidden, (left, right)) in hidden_px.iter_mut().zip(nearness.iter().zip(&nearness[k..])) {
+            for (hidden, (left, right)) in hidden_px
+                .iter_mut()
+                .zip(nearness.iter().zip(&nearness[k..]))
+            {
                 let overlap = (right - left) * self.disparity_px - within;
                 *hidden = if overlap > *hidden { overlap } else { *hidden };
             }
@@ -117,10 +132,10 @@ impl StereoNoise {
         }
     }
 
-    /// Rectangles without a reading, anywhere in the image.
+    /// Removes the readings of random rectangles.
     fn drop_patches(&self, key: u64, image: &mut [u8; IMAGE_PIXELS]) {
         let mut rng = Pcg64Mcg::seed_from_u64(key);
-        // The fraction left over is the chance of one more.
+        // The fractional part is the probability of one more patch.
         let count = (self.patches + rng.random_range(0.0..1.0)) as usize;
         for _ in 0..count {
             let [width, height] = [IMAGE_WIDTH, IMAGE_HEIGHT].map(|most| {

@@ -1,12 +1,14 @@
-//! A stereo camera's errors, against what the settings ask for.
+//! Errors of a stereo camera, compared with the settings.
 
 use nalgebra::Isometry3;
 
-use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, Instructions};
-use crate::course::{Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course};
+use super::{CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, InstructionSet};
+use crate::course::{
+    Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout, test_course,
+};
 use crate::disturbances::{DepthModel, DepthNoiseSettings};
 
-/// The noise alone: no shadows, no patches.
+/// Returns settings with noise alone: no shadows, no patches.
 fn noise_alone() -> DepthNoiseSettings {
     DepthNoiseSettings {
         model: DepthModel::Stereo,
@@ -16,7 +18,8 @@ fn noise_alone() -> DepthNoiseSettings {
     }
 }
 
-/// A wall 41 m along a corridor so wide that a camera before it sees nothing else around the middle; its opening is far aside.
+/// Returns a course with one wall at 41 m, in a corridor so wide that a camera before the wall sees
+/// only the wall around the middle. The opening is far to the side.
 fn wide_hall() -> Course {
     Course::new(CourseLayout {
         name: "hall".into(),
@@ -43,7 +46,7 @@ fn wide_hall() -> Course {
     .unwrap()
 }
 
-/// A camera in the middle of the body.
+/// Returns settings of a camera in the middle of the body.
 fn lens() -> CameraSettings {
     CameraSettings {
         mount_m: [0.0; 3],
@@ -51,22 +54,34 @@ fn lens() -> CameraSettings {
     }
 }
 
-/// An image of the wall from `depth_m` before it.
+/// Returns an image of the wall from `depth_m` before it.
 fn facing_wall(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
     let mut image = Box::new([0; IMAGE_PIXELS]);
-    let mut camera = DepthCamera::new(&lens(), &wide_hall()).unwrap().with_noise(noise);
-    camera.render_with_noise(&Isometry3::translation(41.0 - depth_m, 0.0, 30.0), key, &mut image);
+    let mut camera = DepthCamera::new(&lens(), &wide_hall())
+        .unwrap()
+        .with_noise(noise);
+    camera.render_with_noise(
+        &Isometry3::translation(41.0 - depth_m, 0.0, 30.0),
+        key,
+        &mut image,
+    );
     image
 }
 
-/// An image from before the first wall of the course with one opening of each kind, `depth_m` before it.
+/// Returns an image of the test course's first opening from `depth_m` before its wall.
 fn facing_opening(noise: &DepthNoiseSettings, depth_m: f32, key: u64) -> Box<[u8; IMAGE_PIXELS]> {
     let mut image = Box::new([0; IMAGE_PIXELS]);
     let course = test_course();
     let wall = &course.walls()[0];
     let [y_m, z_m] = wall.safe_point();
-    let mut camera = DepthCamera::new(&lens(), &course).unwrap().with_noise(noise);
-    camera.render_with_noise(&Isometry3::translation(wall.x_m() - depth_m, y_m, z_m), key, &mut image);
+    let mut camera = DepthCamera::new(&lens(), &course)
+        .unwrap()
+        .with_noise(noise);
+    camera.render_with_noise(
+        &Isometry3::translation(wall.x_m() - depth_m, y_m, z_m),
+        key,
+        &mut image,
+    );
     image
 }
 
@@ -79,8 +94,9 @@ fn readings_scatter_by_sigma_around_the_true_depth() {
             .map(|level| f64::from(level) / 255.0 * 20.0)
             .collect();
         let mean = readings.iter().sum::<f64>() / readings.len() as f64;
-        let variance = readings.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / readings.len() as f64;
-        // Rounding to whole levels adds a twelfth of a level's square.
+        let variance =
+            readings.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / readings.len() as f64;
+        // Rounding to whole levels adds a twelfth of a squared level to the variance.
         let level_m = 20.0 / 255.0;
         let sigma = f64::from(noise.sigma_m(depth_m));
         assert!(
@@ -88,7 +104,7 @@ fn readings_scatter_by_sigma_around_the_true_depth() {
             "{depth_m} m: mean {mean}"
         );
         let expected = (sigma.powi(2) + level_m.powi(2) / 12.0).sqrt();
-        // Where the noise is less than a level, rounding is not independent of it.
+        // Noise below one level is not independent of the rounding.
         if sigma > level_m {
             assert!(
                 (variance.sqrt() / expected - 1.0).abs() < 0.02,
@@ -96,28 +112,34 @@ fn readings_scatter_by_sigma_around_the_true_depth() {
                 variance.sqrt()
             );
         } else {
-            assert!(variance.sqrt() < level_m, "{depth_m} m: {} m", variance.sqrt());
+            assert!(
+                variance.sqrt() < level_m,
+                "{depth_m} m: {} m",
+                variance.sqrt()
+            );
         }
     }
 }
 
 #[test]
-fn noise_far_below_a_grey_level_still_shows_where_the_depth_lies_between_two() {
-    // 6.04 m is level 77.01, 6.00 m is 76.5: sigma 0.15 m is two levels.
+fn the_mean_level_shows_a_depth_between_two_grey_levels() {
+    // 6.00 m is level 76.5, and sigma is 0.15 m or two levels.
     let image = facing_wall(&noise_alone(), 6.0, 1);
     let mean = image.iter().map(|&level| f64::from(level)).sum::<f64>() / IMAGE_PIXELS as f64;
     assert!((mean - 76.5).abs() < 0.1, "{mean}");
 }
 
 #[test]
-fn images_of_two_keys_err_independently_and_of_one_key_alike() {
+fn errors_of_two_keys_are_independent_and_of_one_key_equal() {
     let noise = noise_alone();
     let deviation = |key| facing_wall(&noise, 10.0, key).map(|level| f64::from(level) - 127.5);
     let (one, other) = (deviation(1), deviation(2));
     assert!(one == deviation(1));
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / IMAGE_PIXELS as f64;
+    let product = |a: &[f64], b: &[f64]| {
+        a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / IMAGE_PIXELS as f64
+    };
     assert!((product(&one, &other) / product(&one, &one)).abs() < 0.04);
-    // Nor does a pixel err as its neighbour does, to the right or below.
+    // Neighbours to the right and below are independent as well.
     for lag in [1, IMAGE_WIDTH] {
         assert!(
             (product(&one[lag..], &one) / product(&one, &one)).abs() < 0.04,
@@ -127,12 +149,16 @@ fn images_of_two_keys_err_independently_and_of_one_key_alike() {
 }
 
 #[test]
-fn what_is_out_of_range_stays_so() {
-    assert!(facing_wall(&noise_alone(), 30.0, 1).iter().all(|&level| level == 255));
+fn a_surface_out_of_range_has_no_noise() {
+    assert!(
+        facing_wall(&noise_alone(), 30.0, 1)
+            .iter()
+            .all(|&level| level == 255)
+    );
 }
 
 #[test]
-fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
+fn a_shadow_lies_left_of_a_near_edge_and_is_as_wide_as_the_disparity_difference() {
     let shadows_alone = |baseline_m| DepthNoiseSettings {
         model: DepthModel::Stereo,
         sigma_quadratic_per_m: 0.0,
@@ -142,7 +168,8 @@ fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
         dropout_share: 0.0,
         ..Default::default()
     };
-    // The opening shows the next wall 10 m behind; at 64 pixels of focal length, 0.2 m between the lenses, 2 m and 12.3 m, the disparities are 6.4 and 1.0 pixels.
+    // The opening shows the next wall 10 m behind. With a focal length of 64 pixels and a baseline
+    // of 0.2 m, the disparities at 2 m and 12.3 m are 6.4 and 1.0 pixels.
     let row = IMAGE_HEIGHT / 2;
     let of_row = |image: &[u8; IMAGE_PIXELS]| image[row * IMAGE_WIDTH..][..IMAGE_WIDTH].to_vec();
     let (seen, truth) = (
@@ -152,24 +179,31 @@ fn shadow_lies_left_of_near_edges_and_is_as_wide_as_the_disparities_differ() {
     let lost: Vec<usize> = (0..IMAGE_WIDTH)
         .filter(|&column| seen[column] == 0 && truth[column] != 0)
         .collect();
-    // The opening's right edge, where near begins again. Its left edge casts no shadow: the left lens sees less there than the right one.
+    // The opening's right edge, where the near wall begins again. The left edge casts no shadow,
+    // because the left lens sees less there than the right one.
     let edge = (IMAGE_WIDTH / 2..IMAGE_WIDTH)
         .find(|&column| truth[column] < truth[column - 1] / 2)
         .unwrap();
     let (border, within): (Vec<usize>, Vec<usize>) = lost.iter().partition(|&&column| column < 16);
-    assert!((4..=6).contains(&within.len()), "{within:?}, edge at {edge}");
     assert!(
-        within.iter().all(|&column| column < edge && column + 7 > edge),
+        (4..=6).contains(&within.len()),
         "{within:?}, edge at {edge}"
     );
-    // The left border of the image, which the right lens does not see: 6.4 pixels at 2 m, and more at the side that is nearer.
+    assert!(
+        within
+            .iter()
+            .all(|&column| column < edge && column + 7 > edge),
+        "{within:?}, edge at {edge}"
+    );
+    // The right lens does not see the image's left border: 6.4 pixels at 2 m, more where the
+    // corridor's side is nearer.
     assert!((5..=8).contains(&border.len()), "{border:?}");
-    // Everything else is as it was.
+    // All other pixels are unchanged.
     assert!((0..IMAGE_WIDTH).all(|column| lost.contains(&column) || seen[column] == truth[column]));
 }
 
 #[test]
-fn patches_cover_the_share_asked_for_and_are_patches() {
+fn patches_cover_the_configured_share_and_are_contiguous() {
     let patches_alone = DepthNoiseSettings {
         baseline_m: 0.0,
         dropout_share: 0.05,
@@ -185,7 +219,7 @@ fn patches_cover_the_share_asked_for_and_are_patches() {
         }
     }
     let share = lost as f64 / (images as usize * IMAGE_PIXELS) as f64;
-    // A little less than asked for, where patches overlap.
+    // Overlaps make the share slightly less than configured.
     assert!((0.045..0.051).contains(&share), "{share}");
     assert!(
         with_lost_neighbour as f64 > 0.8 * lost as f64,
@@ -194,8 +228,8 @@ fn patches_cover_the_share_asked_for_and_are_patches() {
 }
 
 #[test]
-fn what_has_a_reading_is_never_taken_for_what_has_none() {
-    // Noise as large as the depth itself.
+fn a_noisy_reading_is_never_zero() {
+    // Noise as large as the depth.
     let wild = DepthNoiseSettings {
         sigma_constant_m: 5.0,
         ..noise_alone()
@@ -204,7 +238,7 @@ fn what_has_a_reading_is_never_taken_for_what_has_none() {
 }
 
 #[test]
-fn camera_without_noise_draws_the_truth_whatever_the_key() {
+fn a_camera_without_noise_ignores_the_key() {
     let off = DepthNoiseSettings::default();
     let mut truth = [0; IMAGE_PIXELS];
     DepthCamera::new(&lens(), &wide_hall())
@@ -214,7 +248,7 @@ fn camera_without_noise_draws_the_truth_whatever_the_key() {
 }
 
 #[test]
-fn instructions_do_not_change_a_bit_of_the_errors() {
+fn instruction_sets_change_no_bit_of_the_errors() {
     let settings = DepthNoiseSettings {
         model: DepthModel::Stereo,
         ..Default::default()
@@ -227,7 +261,10 @@ fn instructions_do_not_change_a_bit_of_the_errors() {
     let [mut plain, mut wider] = [[0; IMAGE_PIXELS]; 2];
     camera.draw = super::draw;
     camera.render_with_noise(&pose, 9, &mut plain);
-    for set in Instructions::ALL.into_iter().filter(|set| set.is_available()) {
+    for set in InstructionSet::ALL
+        .into_iter()
+        .filter(|set| set.is_available())
+    {
         camera.draw = set.draw();
         camera.render_with_noise(&pose, 9, &mut wider);
         assert!(plain == wider, "{set}");

@@ -1,39 +1,48 @@
-//! The depth image, one ray at a time.
+//! The depth image by ray casting: slow, but obviously correct.
 //!
-//! Slow and obviously right: it casts a ray through the middle of each pixel against the course's triangles. The fast
-//! camera is held to it pixel by pixel.
+//! A ray through the middle of each pixel is cast against the course's triangles. Tests compare
+//! the fast camera with it, pixel by pixel.
 
 use nalgebra::{Isometry3, Vector3};
 use parry3d::math::Vector;
 use parry3d::query::{Ray, RayCullingMode};
 use parry3d::shape::{TriMesh, TriMeshBuilderError};
 
-use super::settings::{MIDDLE_PX, View};
+use super::settings::{CameraView, MIDDLE_PX};
 use super::{CameraSettings, IMAGE_PIXELS, IMAGE_WIDTH};
 use crate::course::Course;
 
-/// A camera that casts rays. For comparison, not for flying.
+/// Depth camera that casts rays, for comparison in tests and benchmarks.
 pub struct ReferenceCamera {
     settings: CameraSettings,
     surfaces: TriMesh,
 }
 
 impl ReferenceCamera {
-    /// A camera in this course.
+    /// Builds a camera in this course.
     ///
     /// # Errors
-    /// [`TriMeshBuilderError`] if the course's surfaces are no triangle mesh.
+    /// [`TriMeshBuilderError`] if the course's surfaces form no triangle mesh.
     pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, TriMeshBuilderError> {
         let mesh = course.mesh();
-        let vertices = mesh.vertices.iter().map(|v| Vector::new(v.x, v.y, v.z)).collect();
-        let triangles = mesh.triangles().into_iter().map(|(triangle, _)| triangle).collect();
+        let vertices = mesh
+            .vertices
+            .iter()
+            .map(|v| Vector::new(v.x, v.y, v.z))
+            .collect();
+        let triangles = mesh
+            .triangles()
+            .into_iter()
+            .map(|(triangle, _)| triangle)
+            .collect();
         Ok(Self {
             settings: settings.clone(),
             surfaces: TriMesh::new(vertices, triangles)?,
         })
     }
 
-    /// What the camera sees with the body at `world_from_body`: see [`DepthCamera::render`](super::DepthCamera::render).
+    /// Draws the depth image into `image`, with the body at `world_from_body`, like
+    /// [`DepthCamera::render`](super::DepthCamera::render).
     pub fn render(&self, world_from_body: &Isometry3<f32>, image: &mut [u8; IMAGE_PIXELS]) {
         let view = self.settings.view(world_from_body);
         for (number, pixel) in image.iter_mut().enumerate() {
@@ -43,17 +52,21 @@ impl ReferenceCamera {
         }
     }
 
-    /// Grey level at a point of the image, in pixels from its left and upper border.
-    pub(super) fn grey(&self, view: &View, column: f32, row: f32) -> u8 {
+    /// Returns the grey level at a point of the image, in pixels from its left and upper border.
+    pub(super) fn grey(&self, view: &CameraView, column: f32, row: f32) -> u8 {
         let share = self.depth_m(view, column, row) / self.settings.range_m;
         (255.0 * share.min(1.0)).round() as u8
     }
 
-    /// Depth of the first surface that faces the camera beyond the near distance; infinite if there is none in range.
-    fn depth_m(&self, view: &View, column: f32, row: f32) -> f32 {
+    /// Returns the depth of the first surface beyond the near distance that faces the camera;
+    /// infinite if none is in range.
+    fn depth_m(&self, view: &CameraView, column: f32, row: f32) -> f32 {
         let focal = self.settings.focal_px();
-        let [across, along] = [(column - MIDDLE_PX[0]) / focal, (row - MIDDLE_PX[1]) / focal];
-        // One unit of this direction is one metre of depth, so the time of impact is the depth.
+        let [across, along] = [
+            (column - MIDDLE_PX[0]) / focal,
+            (row - MIDDLE_PX[1]) / focal,
+        ];
+        // One unit of this direction is one metre of depth, so the time of impact is a depth.
         let direction = view.forward + view.right * across + view.down * along;
         let begin = view.eye + direction * self.settings.near_m;
         let to_parry = |v: Vector3<f32>| Vector::new(v.x, v.y, v.z);
@@ -61,6 +74,8 @@ impl ReferenceCamera {
         let left_m = self.settings.range_m - self.settings.near_m;
         self.surfaces
             .cast_local_ray_with_culling(&ray, left_m, RayCullingMode::IgnoreBackfaces)
-            .map_or(f32::INFINITY, |hit| self.settings.near_m + hit.time_of_impact)
+            .map_or(f32::INFINITY, |hit| {
+                self.settings.near_m + hit.time_of_impact
+            })
     }
 }

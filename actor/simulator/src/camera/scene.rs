@@ -1,57 +1,59 @@
-//! A course's surfaces as the camera draws them.
+//! A course's surfaces, prepared for drawing.
 
 use std::ops::Range;
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::CameraSettings;
-use super::canvas::{Canvas, ImagePoint, Nearness};
-use super::settings::{MIDDLE_PX, View};
-use crate::course::{Mesh, Surface, SurfaceKind};
+use super::canvas::{DepthCanvas, ImagePoint, Nearness};
+use super::settings::{CameraView, MIDDLE_PX};
+use crate::course::{Mesh, MeshSurface, SurfaceKind};
 
-/// Distance from its plane below which a surface is seen edge-on, metres: nothing of it then shows.
+/// Distance of the lens from a surface's plane below which the surface is edge-on and invisible,
+/// metres.
 const EDGE_ON_M: f32 = 1e-6;
 
-/// The surfaces of a mesh in parts, each skipped as a whole when it is out of sight.
+/// Surfaces of a mesh, grouped into parts. A part out of sight is skipped as a whole.
 pub(super) struct Scene {
-    parts: Vec<Part>,
-    /// Where the edges of a face meet the near plane; scratch memory.
+    parts: Vec<ScenePart>,
+    /// Points where a face's edges meet the near plane; scratch memory.
     cuts: Vec<ImagePoint>,
 }
 
-/// The corridor's inside, or a wall.
-struct Part {
+/// The inside of the corridor, or one wall.
+struct ScenePart {
     vertices: Vec<Point3<f32>>,
-    faces: Vec<Face>,
-    /// The box around the vertices: its middle and half its size, metres.
+    faces: Vec<SceneFace>,
+    /// Middle of the box around the vertices, metres.
     middle: Point3<f32>,
+    /// Half the size of that box, metres.
     half_size: Vector3<f32>,
-    /// The vertices as the camera sees them; scratch memory.
-    seen: Vec<Seen>,
+    /// The vertices, projected; scratch memory.
+    projected: Vec<ProjectedVertex>,
 }
 
-/// A flat face, seen from the side that its normal points to.
-struct Face {
+/// A flat face, visible from the side to which its normal points.
+struct SceneFace {
     normal: Vector3<f32>,
     offset_m: f32,
-    /// Closed loops of vertex numbers, one after the other.
+    /// Vertex numbers of all closed loops, one loop after the other.
     corners: Vec<u32>,
-    /// Where each loop lies in `corners`.
+    /// Range of each loop within `corners`.
     loops: Vec<Range<usize>>,
 }
 
 /// A vertex in the optical frame and in the image.
 #[derive(Clone, Copy)]
-struct Seen {
-    /// Right, down, forward of the lens, metres.
+struct ProjectedVertex {
+    /// Position right, down and forward of the lens, metres.
     at_m: Vector3<f32>,
-    /// Meaningful beyond the near distance only.
+    /// Position in the image; meaningful only beyond the near distance.
     image: ImagePoint,
 }
 
-/// What every part needs of settings and pose.
-struct Eye {
-    at: Point3<f32>,
+/// Projection of the world into the image, for one pose.
+struct Projection {
+    eye: Point3<f32>,
     camera_from_world: Matrix3<f32>,
     focal_px: f32,
     near_m: f32,
@@ -60,12 +62,14 @@ struct Eye {
 
 impl Scene {
     pub(super) fn new(mesh: &Mesh) -> Self {
-        let wall = |surface: &Surface| match surface.kind {
+        let wall = |surface: &MeshSurface| match surface.kind {
             SurfaceKind::Wall(place) => Some(place),
             SurfaceKind::Corridor | SurfaceKind::EndWall => None,
         };
         let parts = mesh.surfaces.chunk_by(|a, b| wall(a) == wall(b));
-        let parts: Vec<_> = parts.map(|surfaces| Part::new(mesh, surfaces)).collect();
+        let parts: Vec<_> = parts
+            .map(|surfaces| ScenePart::new(mesh, surfaces))
+            .collect();
         let faces = parts.iter().flat_map(|part| &part.faces);
         let most_corners = faces.map(|face| face.corners.len()).max().unwrap_or(0);
         Self {
@@ -76,83 +80,102 @@ impl Scene {
 
     /// Draws all surfaces in sight onto a clear canvas.
     #[inline(always)]
-    pub(super) fn draw(&mut self, settings: &CameraSettings, view: &View, canvas: &mut Canvas) {
-        let eye = Eye {
-            at: view.eye,
+    pub(super) fn draw(
+        &mut self,
+        settings: &CameraSettings,
+        view: &CameraView,
+        canvas: &mut DepthCanvas,
+    ) {
+        let projection = Projection {
+            eye: view.eye,
             camera_from_world: view.camera_from_world(),
             focal_px: settings.focal_px(),
             near_m: settings.near_m,
             range_m: settings.range_m,
         };
         for part in &mut self.parts {
-            if part.reaches_into_range(&eye) {
-                part.look(&eye);
-                part.draw(&eye, &mut self.cuts, canvas);
+            if part.reaches_into_range(&projection) {
+                part.project(&projection);
+                part.draw(&projection, &mut self.cuts, canvas);
             }
         }
     }
 }
 
-impl Part {
-    fn new(mesh: &Mesh, surfaces: &[Surface]) -> Self {
+impl ScenePart {
+    fn new(mesh: &Mesh, surfaces: &[MeshSurface]) -> Self {
         let used = surfaces
             .iter()
             .flat_map(|surface| surface.loops.iter().flatten().copied());
         let first = used.clone().min().unwrap_or(0);
         let end = used.max().map_or(0, |last| last + 1);
         let vertices = mesh.vertices[first as usize..end as usize].to_vec();
-        let least = vertices.iter().copied().reduce(|a, b| a.inf(&b)).unwrap_or_default();
-        let most = vertices.iter().copied().reduce(|a, b| a.sup(&b)).unwrap_or_default();
-        let nowhere = Seen {
+        let least = vertices
+            .iter()
+            .copied()
+            .reduce(|a, b| a.inf(&b))
+            .unwrap_or_default();
+        let most = vertices
+            .iter()
+            .copied()
+            .reduce(|a, b| a.sup(&b))
+            .unwrap_or_default();
+        let nowhere = ProjectedVertex {
             at_m: Vector3::zeros(),
-            image: ImagePoint { column: 0.0, row: 0.0 },
+            image: ImagePoint {
+                column: 0.0,
+                row: 0.0,
+            },
         };
         Self {
-            faces: surfaces.iter().map(|surface| Face::new(surface, first)).collect(),
+            faces: surfaces
+                .iter()
+                .map(|surface| SceneFace::new(surface, first))
+                .collect(),
             middle: nalgebra::center(&least, &most),
             half_size: (most - least) / 2.0,
-            seen: vec![nowhere; vertices.len()],
+            projected: vec![nowhere; vertices.len()],
             vertices,
         }
     }
 
-    /// Whether any point of the box can lie between the near distance and the range.
+    /// Returns `true` if a point of the box can lie between the near distance and the range.
     #[inline(always)]
-    fn reaches_into_range(&self, eye: &Eye) -> bool {
-        let forward = eye.camera_from_world.row(2).transpose();
-        let middle_m = forward.dot(&(self.middle - eye.at));
+    fn reaches_into_range(&self, projection: &Projection) -> bool {
+        let forward = projection.camera_from_world.row(2).transpose();
+        let middle_m = forward.dot(&(self.middle - projection.eye));
         let reach_m = forward.abs().dot(&self.half_size);
-        middle_m + reach_m > eye.near_m && middle_m - reach_m < eye.range_m
+        middle_m + reach_m > projection.near_m && middle_m - reach_m < projection.range_m
     }
 
-    /// Brings the vertices into the optical frame and the image.
+    /// Projects the vertices into the optical frame and the image.
     #[inline(always)]
-    fn look(&mut self, eye: &Eye) {
-        for (vertex, seen) in self.vertices.iter().zip(&mut self.seen) {
-            let at_m = eye.camera_from_world * (vertex - eye.at);
-            *seen = Seen {
+    fn project(&mut self, projection: &Projection) {
+        for (vertex, projected) in self.vertices.iter().zip(&mut self.projected) {
+            let at_m = projection.camera_from_world * (vertex - projection.eye);
+            *projected = ProjectedVertex {
                 at_m,
-                image: eye.project(at_m),
+                image: projection.project(at_m),
             };
         }
     }
 
     #[inline(always)]
-    fn draw(&self, eye: &Eye, cuts: &mut Vec<ImagePoint>, canvas: &mut Canvas) {
+    fn draw(&self, projection: &Projection, cuts: &mut Vec<ImagePoint>, canvas: &mut DepthCanvas) {
         for face in &self.faces {
-            let above_m = face.normal.dot(&eye.at.coords) - face.offset_m;
-            // Written so that a pose that is not a number sees nothing.
+            let above_m = face.normal.dot(&projection.eye.coords) - face.offset_m;
+            // Written so that nothing is drawn if the pose is NaN.
             if above_m > EDGE_ON_M {
-                face.outline(&self.seen, eye, cuts, canvas);
-                canvas.fill(eye.nearness(face.normal, above_m));
+                face.outline(&self.projected, projection, cuts, canvas);
+                canvas.fill(projection.nearness(face.normal, above_m));
             }
         }
     }
 }
 
-impl Face {
+impl SceneFace {
     /// `first`: number of the part's first vertex.
-    fn new(surface: &Surface, first: u32) -> Self {
+    fn new(surface: &MeshSurface, first: u32) -> Self {
         let mut loops = Vec::new();
         let mut corners = Vec::new();
         for ring in &surface.loops {
@@ -168,27 +191,37 @@ impl Face {
         }
     }
 
-    /// Adds to the canvas what of the face's edges lies beyond the near distance, and what closes them there.
+    /// Adds the face's edges beyond the near distance to the canvas, and closes them along the near
+    /// plane.
     ///
     /// `cuts`: scratch memory.
     #[inline(always)]
-    fn outline(&self, seen: &[Seen], eye: &Eye, cuts: &mut Vec<ImagePoint>, canvas: &mut Canvas) {
+    fn outline(
+        &self,
+        projected: &[ProjectedVertex],
+        projection: &Projection,
+        cuts: &mut Vec<ImagePoint>,
+        canvas: &mut DepthCanvas,
+    ) {
         cuts.clear();
         for range in &self.loops {
             let ring = &self.corners[range.clone()];
             let Some(&last) = ring.last() else { continue };
-            let mut from = seen[last as usize];
+            let mut from = projected[last as usize];
             for &corner in ring {
-                let to = seen[corner as usize];
-                match (from.at_m.z >= eye.near_m, to.at_m.z >= eye.near_m) {
+                let to = projected[corner as usize];
+                match (
+                    from.at_m.z >= projection.near_m,
+                    to.at_m.z >= projection.near_m,
+                ) {
                     (true, true) => canvas.add_edge(from.image, to.image),
                     (true, false) => {
-                        let cut = eye.cross_near_plane(from.at_m, to.at_m);
+                        let cut = projection.cross_near_plane(from.at_m, to.at_m);
                         canvas.add_edge(from.image, cut);
                         cuts.push(cut);
                     }
                     (false, true) => {
-                        let cut = eye.cross_near_plane(to.at_m, from.at_m);
+                        let cut = projection.cross_near_plane(to.at_m, from.at_m);
                         canvas.add_edge(cut, to.image);
                         cuts.push(cut);
                     }
@@ -205,14 +238,18 @@ impl Face {
 
 /// Closes an outline along the near plane.
 ///
-/// The cuts lie on one line, and the face between every other two of them. Closing each loop by itself would lay edges of the rim
-/// and of the hole over each other, which cancel only as far as their arithmetic agrees: a slit of near pixels remained.
-fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut Canvas) {
+/// The cuts lie on one line, and the face lies between the first and second, the third and fourth,
+/// and so on. Closing each loop separately would put edges of the rim and of the hole on top of
+/// each other. They cancel only as far as their arithmetic agrees, which left a slit of near
+/// pixels.
+fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut DepthCanvas) {
     let extent = |along: fn(&ImagePoint) -> f32| {
         let (least, most) = cuts
             .iter()
             .map(along)
-            .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, m), at| (l.min(at), m.max(at)));
+            .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, m), at| {
+                (l.min(at), m.max(at))
+            });
         most - least
     };
     let steep = extent(|cut| cut.row) > extent(|cut| cut.column);
@@ -223,7 +260,7 @@ fn close_along_cuts(cuts: &mut [ImagePoint], canvas: &mut Canvas) {
     }
 }
 
-impl Eye {
+impl Projection {
     #[inline(always)]
     fn project(&self, at_m: Vector3<f32>) -> ImagePoint {
         let scale = self.focal_px / at_m.z;
@@ -233,7 +270,8 @@ impl Eye {
         }
     }
 
-    /// Where the way from `beyond` to `before` meets the near plane. Both faces at an edge ask with the same two points.
+    /// Returns the point where the edge from `beyond` to `before` meets the near plane. Both faces
+    /// of an edge pass the same two points.
     #[inline(always)]
     fn cross_near_plane(&self, beyond: Vector3<f32>, before: Vector3<f32>) -> ImagePoint {
         let share = (beyond.z - self.near_m) / (beyond.z - before.z);
@@ -241,11 +279,12 @@ impl Eye {
         self.project(Vector3::new(at_m.x, at_m.y, self.near_m))
     }
 
-    /// Of a plane with the world normal `normal`, `above_m` metres above which the lens is.
+    /// Returns the nearness of a plane with the world normal `normal`; the lens is `above_m` metres
+    /// above it.
     #[inline(always)]
     fn nearness(&self, normal: Vector3<f32>, above_m: f32) -> Nearness {
-        // A point of the plane: normal . (p - eye) = -above. With p - eye = depth * (column / focal, row / focal, 1) in the
-        // optical frame, 1 / depth is affine in the image.
+        // A point of the plane: normal . (p - eye) = -above. With p - eye = depth * (column /
+        // focal, row / focal, 1) in the optical frame, 1 / depth is affine in the image.
         let scaled = self.camera_from_world * normal * (-self.range_m / above_m);
         Nearness {
             per_column: scaled.x / self.focal_px,

@@ -1,24 +1,29 @@
-//! What the camera is and where it sits.
+//! The `[simulator.camera]` section of the configuration.
 
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use super::{IMAGE_HEIGHT, IMAGE_WIDTH};
+use crate::text::exactly;
 
-/// The depth camera's optics and mounting. Section `[camera]` of the simulator's settings.
+/// The depth camera's optics and mounting: section `[simulator.camera]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CameraSettings {
-    /// Angle between the image's left and right border, degrees. Pixels are square. Source: AirSim's default, 90.
+    /// Angle between the image's left and right border, degrees. Pixels are square. Default 90,
+    /// AirSim's default.
     pub horizontal_fov_deg: f32,
-    /// Depth that is shown as 255, metres: whatever is farther looks the same. Two walls ahead are seen at 20 m; 8 bits are
-    /// then 8 cm each. The paper does not give it.
+    /// Depth shown as 255, metres; everything farther looks the same. Default 20: the camera sees
+    /// the next two walls, and one step of the 8 bits is 8 cm. The paper does not give it.
     pub range_m: f32,
-    /// Depth below which nothing is seen, metres. The lens sits inside the body, which would have collided before.
+    /// Depth below which a surface is invisible, metres. Default 0.02: the lens sits inside the
+    /// body, which would have collided before.
     pub near_m: f32,
-    /// Lens in the body frame (forward, left, up), metres. The default lies inside the body of every vehicle preset.
+    /// Position of the lens in the body frame (forward, left, up), metres. The default
+    /// `[0.2, 0, 0]` lies inside the body of every vehicle preset.
+    #[serde(deserialize_with = "exactly")]
     pub mount_m: [f32; 3],
-    /// How far the optical axis points above the body's forward axis, degrees.
+    /// Angle of the optical axis above the body's forward axis, degrees. Default 0.
     pub mount_pitch_deg: f32,
 }
 
@@ -34,10 +39,10 @@ impl Default for CameraSettings {
     }
 }
 
-/// A camera setting that makes no sense.
+/// A camera setting that is out of bounds.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("camera: key {key} = {value} must lie between {least} and {most}")]
-pub struct CameraFault {
+#[error("[simulator.camera] {key} = {value} is outside {least} to {most}")]
+pub struct CameraSettingsError {
     /// The key.
     pub key: &'static str,
     /// The value found.
@@ -49,16 +54,17 @@ pub struct CameraFault {
 }
 
 impl CameraSettings {
-    /// Whether a camera can be built to these settings.
+    /// Checks every value against its bounds.
     ///
     /// # Errors
-    /// The first [`CameraFault`].
-    pub fn check(&self) -> Result<(), CameraFault> {
+    /// [`CameraSettingsError`] names the first key at fault.
+    pub fn validate(&self) -> Result<(), CameraSettingsError> {
         let [x, y, z] = self.mount_m;
         let bounds = [
             ("horizontal_fov_deg", self.horizontal_fov_deg, 10.0, 150.0),
             ("near_m", self.near_m, 0.001, 1.0),
-            // An 8-bit step of 4 m would show nothing; a range within the near distance nothing at all.
+            // Above 1000 m a step of the 8 bits would be 4 m, too coarse to fly by; a range within
+            // the near distance would show nothing.
             ("range_m", self.range_m, 2.0 * self.near_m, 1000.0),
             ("mount_m[0]", x, -2.0, 2.0),
             ("mount_m[1]", y, -2.0, 2.0),
@@ -68,7 +74,7 @@ impl CameraSettings {
         for (key, value, least, most) in bounds {
             // Written so that a NaN is refused as well.
             if !(least..=most).contains(&value) {
-                return Err(CameraFault {
+                return Err(CameraSettingsError {
                     key,
                     value,
                     least,
@@ -79,17 +85,17 @@ impl CameraSettings {
         Ok(())
     }
 
-    /// Distance of the image plane in pixels: a point at `(right, down, forward)` falls `focal * right / forward` pixels
-    /// to the right of the image's middle.
+    /// Returns the focal length in pixels: a point at `(right, down, forward)` falls `focal * right
+    /// / forward` pixels to the right of the image's middle.
     pub(super) fn focal_px(&self) -> f32 {
         IMAGE_WIDTH as f32 / 2.0 / (self.horizontal_fov_deg.to_radians() / 2.0).tan()
     }
 
-    /// Where the lens is, and the image's axes, when the body is at `world_from_body`.
-    pub(super) fn view(&self, world_from_body: &Isometry3<f32>) -> View {
+    /// Returns the lens and the image's axes, with the body at `world_from_body`.
+    pub(super) fn view(&self, world_from_body: &Isometry3<f32>) -> CameraView {
         let (sin, cos) = self.mount_pitch_deg.to_radians().sin_cos();
         let in_world = |body: Vector3<f32>| world_from_body.rotation * body;
-        View {
+        CameraView {
             eye: world_from_body * Point3::from(self.mount_m),
             right: in_world(-Vector3::y()),
             down: in_world(Vector3::new(sin, 0.0, -cos)),
@@ -98,25 +104,29 @@ impl CameraSettings {
     }
 }
 
-/// The lens in the world, and the image's axes as unit vectors of the world.
+/// Position of the lens and the image's axes, in the world frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct View {
-    /// The lens, metres.
+pub(super) struct CameraView {
+    /// Position of the lens, metres.
     pub eye: Point3<f32>,
-    /// Along the image's rows.
+    /// Unit vector along the image's rows.
     pub right: Vector3<f32>,
-    /// Along the image's columns.
+    /// Unit vector along the image's columns.
     pub down: Vector3<f32>,
-    /// Along the optical axis: depth is measured along it.
+    /// Unit vector along the optical axis, along which depth is measured.
     pub forward: Vector3<f32>,
 }
 
-impl View {
-    /// World vector to the optical frame.
+impl CameraView {
+    /// Returns the rotation from the world frame to the optical frame.
     pub(super) fn camera_from_world(&self) -> Matrix3<f32> {
-        Matrix3::from_rows(&[self.right.transpose(), self.down.transpose(), self.forward.transpose()])
+        Matrix3::from_rows(&[
+            self.right.transpose(),
+            self.down.transpose(),
+            self.forward.transpose(),
+        ])
     }
 }
 
-/// Where the optical axis meets the image, pixels from its left and upper border.
+/// Point of the image on the optical axis, pixels from its left and upper border.
 pub(super) const MIDDLE_PX: [f32; 2] = [IMAGE_WIDTH as f32 / 2.0, IMAGE_HEIGHT as f32 / 2.0];

@@ -1,22 +1,24 @@
-//! What a layout must satisfy to be a course.
+//! Rules that a layout must satisfy to become a course.
 //!
-//! Every rule exists because the flight would otherwise be impossible or the numbers meaningless; each names what to change.
+//! Without each rule, an episode could be impossible or a number meaningless. Each error names what
+//! to change.
 
 use super::{
-    BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, Place, Shape, Wall,
-    WallLabel, WallLayout, polygon,
+    BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, FaultLocation, MAX_CORNERS,
+    MAX_WALLS, Shape, Wall, WallLabel, WallLayout, polygon,
 };
 
-/// Way flown at 1 m/s before a sidestep has settled, metres: three time constants of the slowest vehicle (0.9 s) and half its length.
+/// Distance flown at 1 m/s until a sidestep has settled, metres: three time constants of the
+/// slowest vehicle (0.9 s) plus half its length.
 const SETTLING_M: f32 = 3.2;
 
-/// Largest length that any key may hold, metres.
+/// Largest length accepted for any key, metres.
 const LARGEST_M: f32 = 1000.0;
 
 pub(super) fn corridor_and_start(course: &Course) -> Result<(), CourseFault> {
     let corridor = course.corridor;
     let thickness_m = course.wall_thickness_m;
-    let check = |key, value, least, most| in_range(Place::Course, key, value, least, most);
+    let check = |key, value, least, most| in_range(FaultLocation::Course, key, value, least, most);
     check("corridor.length_m", corridor.length_m, 5.0, LARGEST_M)?;
     check("corridor.width_m", corridor.width_m, 2.0, 100.0)?;
     check("corridor.height_m", corridor.height_m, 2.0, 100.0)?;
@@ -44,9 +46,13 @@ pub(super) fn corridor_and_start(course: &Course) -> Result<(), CourseFault> {
     )
 }
 
-/// The wall, if it can be flown through by itself and after the walls already in the course.
+/// Returns the wall if the drone can fly through it, also after the walls already in the course.
 pub(super) fn next_wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
-    if course.walls.iter().any(|wall| wall.label == candidate.label) {
+    if course
+        .walls
+        .iter()
+        .any(|wall| wall.label == candidate.label)
+    {
         return Err(CourseFault::RepeatedWall {
             wall: candidate.label,
             key: "order",
@@ -57,7 +63,7 @@ pub(super) fn next_wall(course: &Course, candidate: WallLayout) -> Result<Wall, 
     Ok(wall)
 }
 
-/// A course has walls, and not more than its levels can be counted.
+/// Checks the number of walls: a `u8` must count the levels.
 pub(super) fn wall_count(count: usize) -> Result<(), CourseFault> {
     match count {
         1..=MAX_WALLS => Ok(()),
@@ -99,16 +105,22 @@ fn wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
     })
 }
 
-/// Numbers of the opening, key by key.
+/// Checks the opening's numbers, key by key.
 fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
-    let place = Place::Wall(wall);
+    let location = FaultLocation::Wall(wall);
     let opening = &candidate.opening;
     for centre in opening.centre_m {
-        in_range(place, "centre_m", centre, -LARGEST_M, LARGEST_M)?;
+        in_range(location, "centre_m", centre, -LARGEST_M, LARGEST_M)?;
     }
-    in_range(place, "rotation_deg", opening.rotation_deg, -360.0, 360.0)?;
+    in_range(
+        location,
+        "rotation_deg",
+        opening.rotation_deg,
+        -360.0,
+        360.0,
+    )?;
     for (key, value_m) in opening.shape.lengths_m() {
-        in_range(place, key, value_m, 0.0, LARGEST_M)?;
+        in_range(location, key, value_m, 0.0, LARGEST_M)?;
         if key != "arm_m" && value_m < DRONE_WIDTH_M {
             return Err(CourseFault::NarrowerThanDrone { wall, key, value_m });
         }
@@ -124,8 +136,8 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
             height_m,
             arm_m,
         } => {
-            // An arm as thick as the whole shape is a rectangle with corners on top of each other.
-            in_range(place, "arm_m", arm_m, 0.01, 0.99 * width_m.min(height_m))
+            // An arm as thick as the whole shape would give corners on top of each other.
+            in_range(location, "arm_m", arm_m, 0.01, 0.99 * width_m.min(height_m))
         }
         Shape::Polygon { ref points_m } => {
             if !(3..=MAX_CORNERS).contains(&points_m.len()) {
@@ -134,16 +146,22 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
                     count: points_m.len(),
                 });
             }
-            points_m
-                .iter()
-                .flatten()
-                .try_for_each(|&value| in_range(place, "points_m", value, -LARGEST_M, LARGEST_M))
+            points_m.iter().flatten().try_for_each(|&value| {
+                in_range(location, "points_m", value, -LARGEST_M, LARGEST_M)
+            })?;
+            match polygon::edges(points_m).position(|(from, to)| from == to) {
+                Some(place) => Err(CourseFault::RepeatedCorner {
+                    wall,
+                    corner: place + 1,
+                }),
+                None => Ok(()),
+            }
         }
         _ => Ok(()),
     }
 }
 
-/// The outline, if it is a simple polygon within the wall's frame.
+/// Returns the outline if it is a simple polygon within the wall's frame.
 fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
     let wall = candidate.label;
     let outline = candidate.opening.outline();
@@ -167,21 +185,22 @@ fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, Cou
     }
 }
 
-/// There is way enough to sidestep from the opening before, and from the start area, to this opening.
+/// Checks that the drone has room to sidestep to this opening from the previous opening and from
+/// the start area.
 fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
-    let before = course.walls.last();
+    let previous = course.walls.last();
     let start = course.start;
-    let behind_m = before.map_or(0.0, |before| before.x_m);
+    let behind_m = previous.map_or(0.0, |previous| previous.x_m);
     let from_start = (
         wall.x_m - behind_m - start.offset_m,
         wall.safe_point[0].abs() + start.jitter_y_m,
         (wall.safe_point[1] - course.corridor.height_m / 2.0).abs() + start.jitter_z_m,
     );
-    let from_wall = before.map(|before| {
+    let from_wall = previous.map(|previous| {
         (
-            wall.x_m - before.x_m - course.wall_thickness_m,
-            (wall.safe_point[0] - before.safe_point[0]).abs(),
-            (wall.safe_point[1] - before.safe_point[1]).abs(),
+            wall.x_m - previous.x_m - course.wall_thickness_m,
+            (wall.safe_point[0] - previous.safe_point[0]).abs(),
+            (wall.safe_point[1] - previous.safe_point[1]).abs(),
         )
     });
     for (gap_m, along_y_m, along_z_m) in [Some(from_start), from_wall].into_iter().flatten() {
@@ -199,13 +218,19 @@ fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
     Ok(())
 }
 
-fn in_range(place: Place, key: &'static str, value: f32, least: f32, most: f32) -> Result<(), CourseFault> {
+fn in_range(
+    location: FaultLocation,
+    key: &'static str,
+    value: f32,
+    least: f32,
+    most: f32,
+) -> Result<(), CourseFault> {
     // Written so that a NaN is refused as well.
     if (least..=most).contains(&value) {
         Ok(())
     } else {
         Err(CourseFault::OutOfRange {
-            place,
+            location,
             key,
             value,
             least,

@@ -1,19 +1,19 @@
-//! Why a course cannot be flown, in words that say what to change.
+//! Reasons why a course cannot be flown, and what to change.
 
 use std::fmt;
 
 use super::{BODY_CLEARANCE_M, DRONE_WIDTH_M, FRAME_M, MAX_CORNERS, MAX_WALLS, WallLabel};
 
-/// Where in a course description a fault lies.
+/// Part of a course description that holds a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Place {
-    /// In what is not part of any wall.
+pub enum FaultLocation {
+    /// Anything outside a wall's definition.
     Course,
-    /// In the definition of this wall.
+    /// The definition of this wall.
     Wall(WallLabel),
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for FaultLocation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Course => f.write_str("course"),
@@ -22,14 +22,20 @@ impl fmt::Display for Place {
     }
 }
 
-/// Why a course is refused: the wall, the key, and the remedy.
+/// Reason why a course is refused: the wall, the key and the remedy.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CourseFault {
-    /// A number outside what makes sense, or not a number.
-    #[error("{place}: key {key} = {value} must lie between {least} and {most}")]
+    /// A name that breaks a table.
+    #[error("course: key name = {name:?} cannot be shown in a table: give one line without |")]
+    Name {
+        /// The name found.
+        name: String,
+    },
+    /// A number out of bounds, or NaN.
+    #[error("{location}: key {key} = {value} must lie between {least} and {most}")]
     OutOfRange {
-        /// Where it stands.
-        place: Place,
+        /// The part of the description.
+        location: FaultLocation,
         /// The key that sets it.
         key: &'static str,
         /// The value found.
@@ -39,12 +45,12 @@ pub enum CourseFault {
         /// Largest value accepted.
         most: f32,
     },
-    /// A key that the shape needs is not there.
+    /// A key that the shape needs is missing.
     #[error("wall {wall}: key {key} is missing: a {shape} needs {needed}")]
     MissingKey {
         /// The wall.
         wall: WallLabel,
-        /// The key looked for.
+        /// The missing key.
         key: &'static str,
         /// The wall's shape.
         shape: &'static str,
@@ -64,7 +70,10 @@ pub enum CourseFault {
         needed: &'static str,
     },
     /// A length smaller than the drone.
-    #[error("wall {wall}: key {key} = {value_m} m is narrower than the drone ({DRONE_WIDTH_M} m): enlarge the opening")]
+    #[error(
+        "wall {wall}: key {key} = {value_m} m is narrower than the drone ({DRONE_WIDTH_M} m): \
+         enlarge the opening"
+    )]
     NarrowerThanDrone {
         /// The wall.
         wall: WallLabel,
@@ -73,10 +82,10 @@ pub enum CourseFault {
         /// The length.
         value_m: f32,
     },
-    /// The widest circle inside the opening has no room for the drone.
+    /// The widest circle inside the opening is too small for the drone.
     #[error(
-        "wall {wall}: the widest circle inside the {shape} has a radius of {clearance_m:.2} m, but the drone needs \
-         {BODY_CLEARANCE_M} m however it is tilted: enlarge the opening"
+        "wall {wall}: the widest circle inside the {shape} has a radius of {clearance_m:.2} m, \
+         but the drone needs {BODY_CLEARANCE_M} m in any attitude: enlarge the opening"
     )]
     TooSmall {
         /// The wall.
@@ -86,7 +95,7 @@ pub enum CourseFault {
         /// Radius of the widest circle inside, metres.
         clearance_m: f32,
     },
-    /// A polygon of too few or too many corners.
+    /// A polygon with too few or too many corners.
     #[error("wall {wall}: key points_m has {count} corners: give 3 to {MAX_CORNERS}")]
     CornerCount {
         /// The wall.
@@ -94,10 +103,20 @@ pub enum CourseFault {
         /// Corners found.
         count: usize,
     },
+    /// A polygon with a corner that follows itself.
+    #[error("wall {wall}: key points_m has corner {corner} twice in a row: remove one")]
+    RepeatedCorner {
+        /// The wall.
+        wall: WallLabel,
+        /// The first of the two corners, from 1.
+        corner: usize,
+    },
     /// A polygon that crosses or touches itself, or has no area.
     #[error(
-        "wall {wall}: the opening's outline crosses or touches itself (edges {} and {}): list the corners in order around it",
-        edges.0 + 1, edges.1 + 1
+        "wall {wall}: the opening's outline crosses or touches itself (edges {} and {}): \
+         list the corners in order around it",
+        edges.0 + 1,
+        edges.1 + 1
     )]
     SelfIntersecting {
         /// The wall.
@@ -105,10 +124,11 @@ pub enum CourseFault {
         /// The two edges, numbered from 0.
         edges: (usize, usize),
     },
-    /// The opening reaches over the wall's rim.
+    /// The opening extends beyond the wall's frame.
     #[error(
-        "wall {wall}: the opening reaches y = {y_m:.2} m, z = {z_m:.2} m, but it must stay within |y| <= {limit_y_m:.2} m and \
-         {FRAME_M} m <= z <= {limit_z_m:.2} m: move centre_m or make it smaller"
+        "wall {wall}: the opening reaches y = {y_m:.2} m, z = {z_m:.2} m, but it must stay within \
+         |y| <= {limit_y_m:.2} m and {FRAME_M} m <= z <= {limit_z_m:.2} m: \
+         move centre_m or make it smaller"
     )]
     OutsideWall {
         /// The wall.
@@ -122,58 +142,66 @@ pub enum CourseFault {
         /// Largest z accepted, metres.
         limit_z_m: f32,
     },
-    /// The wall is not inside the corridor, or leaves the drone no room at its end.
+    /// The wall is outside the corridor, or leaves the drone no room at the corridor's end.
     #[error(
-        "wall {wall}: key wall_x_m = {x_m} m: the wall must stand between {least_m:.2} m and {most_m:.2} m of the corridor"
+        "wall {wall}: key wall_x_m = {x_m} m: the wall must stand between {least_m:.2} m and \
+         {most_m:.2} m of the corridor"
     )]
     OutsideCorridor {
         /// The wall.
         wall: WallLabel,
         /// Its front face, metres.
         x_m: f32,
-        /// First place possible, metres.
+        /// Least position accepted, metres.
         least_m: f32,
-        /// Last place possible, metres.
+        /// Largest position accepted, metres.
         most_m: f32,
     },
-    /// No time to get from the opening before to this one.
+    /// The wall is too close behind the previous one for the sidestep between the openings.
     #[error(
-        "wall {wall}: key wall_x_m leaves {gap_m:.2} m before it, but its opening lies {shift_m:.2} m aside of where the drone comes \
-         from, which takes {needed_m:.2} m at 1 m/s: move the wall back or the openings together"
+        "wall {wall}: key wall_x_m leaves {gap_m:.2} m before it, but the drone must move \
+         {shift_m:.2} m sideways, up or down to its opening, which takes {needed_m:.2} m at 1 m/s: \
+         move the wall back or the openings closer together"
     )]
     TooClose {
-        /// The wall that comes too soon.
+        /// The wall that is too close.
         wall: WallLabel,
-        /// Free way before it, metres.
+        /// Free distance before it, metres.
         gap_m: f32,
-        /// Way to go sideways or up or down, metres.
+        /// Distance to move sideways, up or down, metres.
         shift_m: f32,
-        /// Way needed, metres.
+        /// Free distance needed, metres.
         needed_m: f32,
     },
-    /// `order` names a wall that is not there.
-    #[error("course: key order names wall {wall}, which no [[wall]] defines: correct the order or add the wall")]
+    /// `order` names a wall that is not defined.
+    #[error(
+        "course: key order names wall {wall}, which no [[wall]] defines: correct the order or add \
+         the wall"
+    )]
     UnknownWall {
         /// The label.
         wall: WallLabel,
     },
-    /// A label defined twice, or flown twice.
-    #[error("wall {wall}: stands twice in {key}: each wall has its own label and one place")]
+    /// A label that is defined twice, or that `order` holds twice.
+    #[error("wall {wall}: {key} holds it twice: give each wall its own label and one place")]
     RepeatedWall {
         /// The label.
         wall: WallLabel,
         /// `label` or `order`.
         key: &'static str,
     },
-    /// As many places as walls are needed.
-    #[error("course: key order has {order} walls and wall_x_m {places} places: give as many of each")]
+    /// The lengths of `order` and `wall_x_m` differ.
+    #[error(
+        "course: key order has {order} walls and wall_x_m {places} places: give the same number \
+         of both"
+    )]
     OrderLength {
         /// Length of `order`.
         order: usize,
         /// Length of `wall_x_m`.
         places: usize,
     },
-    /// No walls at all, or more than levels can be counted.
+    /// No walls, or too many.
     #[error("course: {count} walls: give 1 to {MAX_WALLS}")]
     WallCount {
         /// Walls found.

@@ -1,17 +1,21 @@
-//! Courses as TOML files.
+//! Course files, in TOML.
 //!
-//! Walls are defined once, each under its label; `order` puts them into the corridor at the places `wall_x_m`. So a
-//! rearranged course is a changed line of data. A file that is refused is refused by file, wall and key.
+//! A file defines each wall once, under its label. `order` puts the walls into the corridor at the
+//! positions `wall_x_m`, so a rearranged course differs in one line. An error names the file, the
+//! wall and the key.
 
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::whereabouts::Whereabouts;
-use super::{Corridor, Course, CourseFault, CourseLayout, Opening, Place, Shape, StartArea, WallLabel, WallLayout};
-use crate::text::read_text;
+use super::source_location::SourceLocation;
+use super::{
+    Corridor, Course, CourseFault, CourseLayout, FaultLocation, Opening, Shape, StartArea,
+    WallLabel, WallLayout,
+};
+use crate::text::{exactly, message_of, parse_whole, read_text};
 
-/// Why a course file cannot be flown.
+/// Reason why a course file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CourseError {
     /// The file cannot be read.
@@ -19,27 +23,27 @@ pub enum CourseError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not TOML, an unknown key, or a value of the wrong kind.
-    #[error("{}: {place}: line {line}: {message}", path.display())]
+    /// The file is not TOML, or has an unknown key or a value of the wrong kind.
+    #[error("{}: {location}: line {line}: {message}", path.display())]
     Syntax {
         /// The file.
         path: PathBuf,
         /// The wall whose definition holds the line.
-        place: Place,
+        location: FaultLocation,
         /// The line, from 1.
         line: usize,
-        /// Which key, and what is wrong, on one line; the parser's own error draws a picture over several.
+        /// The key and the problem on one line; the parser's own error takes several.
         message: String,
     },
-    /// The file says something that cannot be flown.
+    /// The file describes a course that cannot be flown.
     #[error("{}: {source}", path.display())]
     Fault {
         /// The file.
         path: PathBuf,
-        /// What and where.
+        /// The fault.
         source: CourseFault,
     },
 }
@@ -58,37 +62,44 @@ impl Course {
         Self::parse(&text, path)
     }
 
-    /// Reads a course from the text of a course file. `path` is named in errors only.
+    /// Reads a course from the text of a course file. `path` serves errors only.
     ///
     /// # Errors
-    /// As [`Course::load`].
+    /// Like [`Course::load`].
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
-        let file: CourseFile = toml::from_str(text).map_err(|error| refused(path, text, &error))?;
-        file.layout().and_then(Self::new).map_err(|source| CourseError::Fault {
-            path: path.to_owned(),
-            source,
-        })
+        let file: CourseFile =
+            parse_whole(text).map_err(|error| syntax_error(path, text, &error))?;
+        file.layout()
+            .and_then(Self::new)
+            .map_err(|source| CourseError::Fault {
+                path: path.to_owned(),
+                source,
+            })
     }
 }
 
-/// The parser's refusal in the words of a course file.
-fn refused(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
-    let Whereabouts { line, place, key } = Whereabouts::of(error.span().unwrap_or_default(), text);
-    let problem = error.message().trim_end().replace('\n', " ");
+/// Converts the parser's error to one that names the wall and the key.
+fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
+    let SourceLocation {
+        line,
+        location,
+        key,
+    } = SourceLocation::of(error.span().unwrap_or_default(), text);
+    let problem = message_of(error);
     let message = match key {
         Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
         _ => problem,
     };
     CourseError::Syntax {
         path: path.to_owned(),
-        place,
+        location,
         line,
         message,
     }
 }
 
-/// A course file as it is written.
+/// Contents of a course file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct CourseFile {
@@ -98,15 +109,16 @@ struct CourseFile {
     wall_thickness_m: f32,
     corridor: Corridor,
     start: StartArea,
-    wall: Vec<WallEntry>,
+    wall: Vec<WallTable>,
 }
 
-/// A `[[wall]]`: which of the optional keys must be there depends on the shape.
+/// Contents of a `[[wall]]` table. The shape decides which of the optional keys it needs.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct WallEntry {
+struct WallTable {
     label: WallLabel,
     shape: ShapeName,
+    #[serde(deserialize_with = "exactly")]
     centre_m: [f32; 2],
     #[serde(default)]
     rotation_deg: f32,
@@ -114,8 +126,12 @@ struct WallEntry {
     height_m: Option<f32>,
     diameter_m: Option<f32>,
     arm_m: Option<f32>,
-    points_m: Option<Vec<[f32; 2]>>,
+    points_m: Option<Vec<Corner>>,
 }
+
+/// Corner `[y, z]` of a polygon.
+#[derive(Deserialize)]
+struct Corner(#[serde(deserialize_with = "exactly")] [f32; 2]);
 
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -131,6 +147,12 @@ enum ShapeName {
 
 impl CourseFile {
     fn layout(self) -> Result<CourseLayout, CourseFault> {
+        if self
+            .name
+            .contains(|sign: char| sign.is_control() || sign == '|')
+        {
+            return Err(CourseFault::Name { name: self.name });
+        }
         if self.order.len() != self.wall_x_m.len() {
             let (order, places) = (self.order.len(), self.wall_x_m.len());
             return Err(CourseFault::OrderLength { order, places });
@@ -169,7 +191,7 @@ impl CourseFile {
     }
 }
 
-impl WallEntry {
+impl WallTable {
     fn opening(mut self) -> Result<Opening, CourseFault> {
         let shape = self.take_shape()?;
         self.refuse_foreign_keys()?;
@@ -180,7 +202,7 @@ impl WallEntry {
         })
     }
 
-    /// Takes the keys of the shape, so that those left over are foreign to it.
+    /// Takes the keys of the shape out of the table; the keys that remain do not belong to it.
     fn take_shape(&mut self) -> Result<Shape, CourseFault> {
         let (wall, shape) = (self.label, self.shape);
         let need = |key: &'static str, value: Option<f32>| {
@@ -199,6 +221,9 @@ impl WallEntry {
             points_m,
             ..
         } = self;
+        let points_m = points_m
+            .take()
+            .map(|corners| corners.into_iter().map(|Corner(place)| place).collect());
         Ok(match shape {
             ShapeName::Rectangle => Shape::Rectangle {
                 width_m: need("width_m", width_m.take())?,
@@ -226,12 +251,14 @@ impl WallEntry {
                 diameter_m: need("diameter_m", diameter_m.take())?,
             },
             ShapeName::Polygon => Shape::Polygon {
-                points_m: points_m.take().ok_or(CourseFault::MissingKey {
-                    wall,
-                    key: "points_m",
-                    shape: shape.name(),
-                    needed: shape.keys(),
-                })?,
+                points_m: points_m
+                    .map(without_closing_corner)
+                    .ok_or(CourseFault::MissingKey {
+                        wall,
+                        key: "points_m",
+                        shape: shape.name(),
+                        needed: shape.keys(),
+                    })?,
             },
         })
     }
@@ -254,6 +281,15 @@ impl WallEntry {
             None => Ok(()),
         }
     }
+}
+
+/// Returns the corners of a polygon without a last one that repeats the first: other programs write
+/// polygons as closed rings.
+fn without_closing_corner(mut points_m: Vec<[f32; 2]>) -> Vec<[f32; 2]> {
+    if points_m.len() > 3 && points_m.first() == points_m.last() {
+        points_m.pop();
+    }
+    points_m
 }
 
 impl ShapeName {

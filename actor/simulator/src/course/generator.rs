@@ -1,8 +1,8 @@
 //! Random courses from a seed.
 //!
-//! What generalises is diversity in training, not more training: a policy that meets random openings cannot learn an order
-//! by heart. An opening is drawn by the free space it leaves: of whatever
-//! shape, a disc of that radius fits.
+//! Diverse courses make a policy generalise, more training on one course does not: with random
+//! openings a policy cannot memorise an order. An opening is sized by its free space: a disc of the
+//! drawn radius fits inside, for any shape.
 
 mod corners;
 
@@ -11,65 +11,77 @@ use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel, WallLayout, check, polygon,
+    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel,
+    WallLayout, check, polygon,
 };
+use crate::text::exactly;
 
-/// What random courses are drawn from. Pairs are the least and the largest value, drawn uniformly.
+/// Ranges for random courses: section `[simulator.generator]`. A pair holds the least and the
+/// largest value, drawn uniformly.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GeneratorRanges {
     /// The corridor.
     pub corridor: Corridor,
-    /// Where flights begin.
+    /// Area in which episodes start.
     pub start: StartArea,
-    /// Front face of each wall, metres; as many walls as entries.
+    /// Front face of each wall, metres; one wall per number. Default 10, 20, 30, 40, 50.
     pub wall_x_m: Vec<f32>,
-    /// Thickness of every wall, metres.
+    /// Thickness of every wall, metres. Default 0.3.
     pub wall_thickness_m: f32,
-    /// Kinds of openings, each as likely to be drawn; where one cannot be flown from the wall before, or does not fit, all is drawn anew, so that kinds which need more room come up less often. Default: the families for training, [`GeneratedShape::TRAINED`].
+    /// Families of openings, drawn with equal probability. If an opening does not fit, or cannot be
+    /// reached from the previous wall, the generator draws everything again, so families that need
+    /// more room are less frequent. Default: [`GeneratedShape::TRAINED`].
     pub shapes: Vec<GeneratedShape>,
     /// Radius of the widest circle inside an opening, metres: at least [`BODY_CLEARANCE_M`].
+    /// Default 0.9 to 1.15.
+    #[serde(deserialize_with = "exactly")]
     pub clearance_m: [f32; 2],
-    /// Turn of an opening, degrees.
+    /// Rotation of an opening, degrees. Default −180 to 180.
+    #[serde(deserialize_with = "exactly")]
     pub rotation_deg: [f32; 2],
 }
 
-/// A kind of opening that the generator draws.
+/// A family of openings that the generator draws.
 ///
-/// Some families are for training, the others are held out, so that flying them shows what an agent makes of shapes that it never met: [`GeneratedShape::TRAINED`],
-/// [`GeneratedShape::HELD_OUT`], [`GeneratedShape::UNTRIED`]. `shapes` decides which are drawn; by default those of training. Neighbours remain: a square on its corner is a diamond of equal
-/// diagonals, a polygon of eight corners is near a circle, a T has an inner corner
-/// as an L and a cross have, and a keyhole, like an L, is widest away from its middle.
+/// Some families are for training ([`GeneratedShape::TRAINED`]). The others are held out, to show
+/// how an agent flies shapes it never met ([`GeneratedShape::HELD_OUT`],
+/// [`GeneratedShape::UNTRIED`]). Some held-out families resemble trained ones: a square on its
+/// corner is a diamond of equal diagonals, a polygon of eight corners is close to a circle, a T has
+/// inner corners like an L and a cross, and a keyhole, like an L, is widest away from its middle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum GeneratedShape {
-    /// Sides up to 1 : 1.4.
+    /// Sides with a ratio up to 1 : 1.4.
     Rectangle,
     /// A circle.
     Circle,
     /// Close to equilateral.
     Triangle,
-    /// Diagonals up to 1 : 1.3.
+    /// Diagonals with a ratio up to 1 : 1.3.
     Diamond,
-    /// Beams of 0.45 to 0.65 of the width.
+    /// Two crossing beams, 0.45 to 0.65 of the width thick.
     Cross,
-    /// Beams of 0.45 to 0.65 of the width.
+    /// Two beams that meet in a corner, 0.45 to 0.65 of the width thick.
     L,
     /// Five to eight corners around the centre.
     Polygon,
-    /// The upper side 0.5 to 0.8 of the lower one.
+    /// An upper side of 0.5 to 0.8 of the lower one.
     Trapezoid,
-    /// A level beam upon an upright one, each of 0.45 to 0.65 of the width.
+    /// A level beam on an upright one, each 0.45 to 0.65 of the width thick.
     T,
-    /// Four to seven points, notches of 0.55 to 0.75 of the radius between them.
+    /// Four to seven points, with notches at 0.55 to 0.75 of the radius between them.
     Star,
-    /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points wherever they come to lie.
+    /// Nine to fourteen corners around a centre, each at 0.4 to 1 of the radius: bays and points at
+    /// random.
     Blob,
-    /// A head of six to nine corners with a slot at one side, 0.4 to 0.65 as wide as the head: what is widest is not in the middle.
+    /// A head of six to nine corners with a slot on one side, 0.4 to 0.65 as wide as the head. Its
+    /// widest part is not in the middle.
     Keyhole,
-    /// What a disc leaves of another that lies 0.9 to 1.3 of the radius beside it.
+    /// A disc without a second one of the same size, whose centre is 0.9 to 1.3 of the radius away.
     Crescent,
-    /// Three beams of 0.36 to 0.44 of the width, 0.8 to 1 as high as it is wide: what is widest are its corners.
+    /// Three beams of 0.36 to 0.44 of the width, 0.8 to 1 as high as wide. Its widest parts are the
+    /// corners.
     U,
 }
 
@@ -85,13 +97,21 @@ impl GeneratedShape {
         Self::Keyhole,
     ];
 
-    /// Families that training never shows: those of the gates in `configs/courses/non_rectangular.toml`.
-    pub const HELD_OUT: [Self; 5] = [Self::Circle, Self::Triangle, Self::Diamond, Self::Cross, Self::L];
+    /// Families held out of training: those of the gates in
+    /// `configs/courses/non_rectangular.toml`.
+    pub const HELD_OUT: [Self; 5] = [
+        Self::Circle,
+        Self::Triangle,
+        Self::Diamond,
+        Self::Cross,
+        Self::L,
+    ];
 
-    /// Families that nothing was ever tuned on. How a policy fared on the gates' families was looked at while `configs/generalist.toml` was made; on these, only once it was finished.
+    /// Families on which nothing was tuned. While `configs/generalist.toml` was developed, results
+    /// on [`Self::HELD_OUT`] were looked at; results on these only after it was finished.
     pub const UNTRIED: [Self; 2] = [Self::Crescent, Self::U];
 
-    /// Its name in the configuration.
+    /// Returns the name in the configuration.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -113,11 +133,14 @@ impl GeneratedShape {
     }
 }
 
-/// Ranges that no course can be drawn from.
+/// Reason why no course can be drawn from ranges.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RangesError {
-    /// A range upside down, or with a bound that is not a number or too small.
-    #[error("generator: {key} = [{least}, {most}] is no range from {smallest} upwards")]
+    /// A range with reversed bounds, or with a bound that is not finite or too small.
+    #[error(
+        "generator: {key} = [{least}, {most}] must be a least and a largest value, both at least \
+         {smallest}"
+    )]
     NoRange {
         /// The key.
         key: &'static str,
@@ -128,24 +151,25 @@ pub enum RangesError {
         /// Smallest lower bound accepted.
         smallest: f32,
     },
-    /// No shapes to choose from.
+    /// No families of openings.
     #[error("generator: shapes is empty: name at least one")]
     NoShapes,
-    /// The corridor, the start area or the number of walls.
+    /// The corridor, the start area or the number of walls is at fault.
     #[error("generator: {0}")]
     Corridor(#[from] CourseFault),
-    /// Nothing drawn from the ranges could be flown.
-    #[error("generator: nothing drawn for wall {wall} could be flown, for instance: {last}")]
+    /// No opening drawn from the ranges could be flown.
+    #[error("generator: no opening drawn for wall {wall} could be flown, for example: {last}")]
     NothingFits {
         /// The wall.
         wall: WallLabel,
-        /// Why the last try was refused.
+        /// Reason why the last attempt was refused.
         last: CourseFault,
     },
 }
 
 impl Default for GeneratorRanges {
-    /// Five walls as in the paper's corridor, with the free space of the shipped courses, of the shapes that are for training.
+    /// Five walls as in the paper's corridor, the free space of the shipped courses, and the
+    /// families for training.
     fn default() -> Self {
         Self {
             corridor: Corridor::default(),
@@ -160,12 +184,12 @@ impl Default for GeneratorRanges {
 }
 
 impl Course {
-    /// The course that belongs to a seed: the same seed and ranges give the same course.
+    /// Generates the course of a seed: the same seed and ranges give the same course.
     ///
     /// # Errors
-    /// [`RangesError`] if the ranges are none, or hold nothing that can be flown.
+    /// [`RangesError`] if the ranges are invalid, or if no course drawn from them can be flown.
     pub fn generate(seed: u64, ranges: &GeneratorRanges) -> Result<Self, RangesError> {
-        ranges.check()?;
+        ranges.validate()?;
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut course = Self::without_walls(
             format!("generated {seed}"),
@@ -179,28 +203,37 @@ impl Course {
         Ok(course)
     }
 
-    /// Draws walls until one can be flown after those already there.
-    fn add_random_wall(&mut self, x_m: f32, ranges: &GeneratorRanges, rng: &mut impl Rng) -> Result<(), RangesError> {
-        /// With the default ranges about every third try fits.
-        const TRIES: u32 = 1000;
+    /// Draws walls until one can be flown after those already in the course.
+    fn add_random_wall(
+        &mut self,
+        x_m: f32,
+        ranges: &GeneratorRanges,
+        rng: &mut impl Rng,
+    ) -> Result<(), RangesError> {
+        /// With the default ranges about every third attempt fits.
+        const MOST_RETRIES: u32 = 1000;
 
         let label = WallLabel(self.walls.len() as u32 + 1);
-        let mut tries = 0;
+        let mut retries = 0;
         loop {
             let opening = ranges.draw_opening(rng);
-            match self.add_wall(WallLayout { label, x_m, opening }) {
+            match self.add_wall(WallLayout {
+                label,
+                x_m,
+                opening,
+            }) {
                 Ok(()) => return Ok(()),
-                Err(last) if tries == TRIES => {
+                Err(last) if retries == MOST_RETRIES => {
                     return Err(RangesError::NothingFits { wall: label, last });
                 }
-                Err(_) => tries += 1,
+                Err(_) => retries += 1,
             }
         }
     }
 }
 
 impl GeneratorRanges {
-    fn check(&self) -> Result<(), RangesError> {
+    fn validate(&self) -> Result<(), RangesError> {
         check::wall_count(self.wall_x_m.len())?;
         if self.shapes.is_empty() {
             return Err(RangesError::NoShapes);
@@ -229,14 +262,17 @@ impl GeneratorRanges {
         let (half_y, height) = (self.corridor.width_m / 2.0, self.corridor.height_m);
         Opening {
             shape: kind.draw(clearance_m, rng),
-            centre_m: [rng.random_range(-half_y..=half_y), rng.random_range(0.0..=height)],
+            centre_m: [
+                rng.random_range(-half_y..=half_y),
+                rng.random_range(0.0..=height),
+            ],
             rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
         }
     }
 }
 
 impl GeneratedShape {
-    /// A shape whose widest inner circle has the radius `clearance_m`.
+    /// Draws a shape whose widest inner circle has the radius `clearance_m`.
     fn draw(self, clearance_m: f32, rng: &mut impl Rng) -> Shape {
         let shape = self.draw_proportions(rng);
         let unscaled = Opening {
@@ -291,7 +327,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_family_is_drawn_with_exactly_the_free_space_asked_for() {
+    fn every_family_is_drawn_with_exactly_the_configured_free_space() {
         let held_out = [&GeneratedShape::HELD_OUT[..], &GeneratedShape::UNTRIED].concat();
         for shape in GeneratedShape::TRAINED.into_iter().chain(held_out) {
             for clearance_m in [BODY_CLEARANCE_M + 0.01, 0.75, 1.0] {
@@ -303,7 +339,7 @@ mod tests {
                 for seed in 0..10 {
                     let course = Course::generate(seed, &ranges).unwrap();
                     for wall in course.walls() {
-                        // The widest circle is found to a millimetre.
+                        // The widest circle is computed to a millimetre.
                         let off_m = (wall.clearance_m() - clearance_m).abs();
                         assert!(off_m < 0.003, "{shape:?}: {} m", wall.clearance_m());
                     }
@@ -313,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn no_family_is_both_trained_on_and_held_out_and_defaults_hold_out() {
+    fn no_trained_family_is_held_out_and_defaults_draw_no_held_out_family() {
         let held_out = [&GeneratedShape::HELD_OUT[..], &GeneratedShape::UNTRIED].concat();
         let is_held_out = |shape: &GeneratedShape| held_out.contains(shape);
         assert!(!GeneratedShape::TRAINED.iter().any(is_held_out));
@@ -321,19 +357,23 @@ mod tests {
     }
 
     #[test]
-    fn every_seed_gives_a_course_with_the_free_space_asked_for() {
+    fn every_seed_gives_a_course_with_the_configured_free_space() {
         let ranges = GeneratorRanges::default();
         let mut outlines = Vec::new();
         for seed in 0..40 {
             let course = Course::generate(seed, &ranges).unwrap();
             assert_eq!(course.walls().len(), 5);
             for wall in course.walls() {
-                assert!((0.89..=1.16).contains(&wall.clearance_m()), "{}", wall.clearance_m());
+                assert!(
+                    (0.89..=1.16).contains(&wall.clearance_m()),
+                    "{}",
+                    wall.clearance_m()
+                );
             }
             outlines.push(course.walls()[0].outline().to_vec());
         }
         outlines.dedup();
-        assert_eq!(outlines.len(), 40, "seeds must give different courses");
+        assert_eq!(outlines.len(), 40, "different seeds give different courses");
     }
 
     #[test]
@@ -367,7 +407,7 @@ mod tests {
         };
         let error = Course::generate(0, &too_wide).unwrap_err().to_string();
         assert!(
-            error.contains("nothing drawn for wall 1") && error.contains("must stay within"),
+            error.contains("no opening drawn for wall 1") && error.contains("must stay within"),
             "{error}"
         );
     }

@@ -1,44 +1,46 @@
-//! Every surface of a course, once: what the camera sees is what the body hits.
+//! Surfaces of a course. The camera draws and the body hits the same surfaces.
 //!
-//! A surface is flat and one-sided: its normal points into the free space. Neighbouring surfaces share their vertices, so
-//! that an edge is the same two numbers on both sides and no crack can open between them.
+//! A surface is flat and one-sided: its normal points into the free space. Neighbouring surfaces
+//! share their vertices, so that no crack can open between them.
 
 use earcut::Earcut;
 use nalgebra::{Point3, Vector3};
 
 use super::{Course, Wall};
 
-/// What a surface belongs to.
+/// Part of the course to which a surface belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum SurfaceKind {
-    /// Floor, ceiling, left and right side of the corridor, and the end behind the start.
+pub(crate) enum SurfaceKind {
+    /// Floor, ceiling and sides of the corridor, and the end behind the start.
     Corridor,
     /// The wall at the corridor's end: the destination.
     EndWall,
-    /// A wall with an opening, by its place in flight order from 0: front, back and the inside of its opening.
+    /// A wall with an opening, by its place in course order from 0: its front, its back and the
+    /// inside of its opening.
     Wall(usize),
 }
 
-/// A flat face, seen from the side its normal points to.
+/// A flat face, visible from the side to which its normal points.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Surface {
-    /// What it belongs to.
-    pub kind: SurfaceKind,
-    /// Closed loops of vertex numbers: the outer rim and, in a wall, the hole. They do not touch each other.
-    pub loops: Vec<Vec<u32>>,
+pub(crate) struct MeshSurface {
+    /// Part of the course to which it belongs.
+    pub(crate) kind: SurfaceKind,
+    /// Closed loops of vertex numbers: the rim and, in a wall, the opening. They do not touch each
+    /// other.
+    pub(crate) loops: Vec<Vec<u32>>,
     /// Unit vector into the free space, world frame.
-    pub normal: Vector3<f32>,
-    /// `normal . p` of every point `p` of the surface, metres.
-    pub offset_m: f32,
+    pub(crate) normal: Vector3<f32>,
+    /// `normal . p` for every point `p` of the surface, metres.
+    pub(crate) offset_m: f32,
 }
 
-/// The surfaces of a course and their corners in the world frame.
+/// Surfaces of a course, and their corners in the world frame.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Mesh {
+pub(crate) struct Mesh {
     /// Corners, metres.
-    pub vertices: Vec<Point3<f32>>,
+    pub(crate) vertices: Vec<Point3<f32>>,
     /// Faces.
-    pub surfaces: Vec<Surface>,
+    pub(crate) surfaces: Vec<MeshSurface>,
 }
 
 impl Mesh {
@@ -54,9 +56,9 @@ impl Mesh {
         mesh
     }
 
-    /// Triangles as vertex numbers, counter-clockwise seen from the free side, each with the number of its surface.
-    #[must_use]
-    pub fn triangles(&self) -> Vec<([u32; 3], usize)> {
+    /// Returns the triangles as vertex numbers, counter-clockwise seen from the free side, each
+    /// with the number of its surface.
+    pub(crate) fn triangles(&self) -> Vec<([u32; 3], usize)> {
         let mut earcut = Earcut::new();
         let mut corners: Vec<u32> = Vec::new();
         let mut triangles = Vec::new();
@@ -71,7 +73,9 @@ impl Mesh {
                 })
                 .take(surface.loops.len() - 1)
                 .collect();
-            let flat = rim.iter().map(|&v| surface.flatten(self.vertices[v as usize]));
+            let flat = rim
+                .iter()
+                .map(|&v| surface.flatten(self.vertices[v as usize]));
             earcut.earcut(flat, &holes, &mut corners);
             for &[a, b, c] in corners.as_chunks::<3>().0 {
                 let [a, b, c] = [a, b, c].map(|corner| rim[corner as usize]);
@@ -93,10 +97,15 @@ impl Mesh {
         let last = self.add_ring(corridor.length_m, &rim_of(course));
         self.add_surface(SurfaceKind::Corridor, vec![first.clone()], Vector3::x());
         self.add_surface(SurfaceKind::EndWall, vec![last.clone()], -Vector3::x());
-        // The rim runs along the floor, up the left side, back along the ceiling, down the right side.
+        // The rim runs along the floor, up the left side, back along the ceiling and down the right
+        // side.
         let inwards = [Vector3::z(), -Vector3::y(), -Vector3::z(), Vector3::y()];
         for (side, inward) in inwards.into_iter().enumerate() {
-            self.add_surface(SurfaceKind::Corridor, vec![band(&first, &last, side)], inward);
+            self.add_surface(
+                SurfaceKind::Corridor,
+                vec![band(&first, &last, side)],
+                inward,
+            );
         }
     }
 
@@ -110,7 +119,7 @@ impl Mesh {
         self.add_surface(kind, vec![front_rim, front_hole.clone()], -Vector3::x());
         self.add_surface(kind, vec![back_rim, back_hole.clone()], Vector3::x());
         for (side, (a, b)) in super::polygon::edges(wall.outline()).enumerate() {
-            // The outline runs counter-clockwise: the free space lies to its left.
+            // The outline runs counter-clockwise, so the free space lies to its left.
             let inward = Vector3::new(0.0, a[1] - b[1], b[0] - a[0]).normalize();
             self.add_surface(kind, vec![band(&front_hole, &back_hole, side)], inward);
         }
@@ -125,7 +134,7 @@ impl Mesh {
 
     fn add_surface(&mut self, kind: SurfaceKind, loops: Vec<Vec<u32>>, normal: Vector3<f32>) {
         let offset_m = normal.dot(&self.vertices[loops[0][0] as usize].coords);
-        self.surfaces.push(Surface {
+        self.surfaces.push(MeshSurface {
             kind,
             loops,
             normal,
@@ -134,8 +143,8 @@ impl Mesh {
     }
 }
 
-impl Surface {
-    /// The point in two coordinates of the surface, leaving out the axis that the normal is nearest to.
+impl MeshSurface {
+    /// Projects a point to two coordinates by dropping the axis nearest to the normal.
     fn flatten(&self, point: Point3<f32>) -> [f32; 2] {
         match self.normal.iamax() {
             0 => [point.y, point.z],
@@ -145,14 +154,14 @@ impl Surface {
     }
 }
 
-/// The corridor's cross-section, counter-clockwise from the right end of the floor.
+/// Returns the corridor's cross-section, counter-clockwise from the right end of the floor.
 fn rim_of(course: &Course) -> [[f32; 2]; 4] {
     let corridor = course.corridor();
     let (half, top) = (corridor.width_m / 2.0, corridor.height_m);
     [[-half, 0.0], [half, 0.0], [half, top], [-half, top]]
 }
 
-/// The quad between the same side of two rings.
+/// Returns the quad between the same side of two rings.
 fn band(near: &[u32], far: &[u32], side: usize) -> Vec<u32> {
     let next = (side + 1) % near.len();
     vec![near[side], near[next], far[next], far[side]]
@@ -183,12 +192,20 @@ mod tests {
             let ring = &surface.loops[0];
             let [a, c] = [ring[0], ring[2]].map(|v| mesh.vertices[v as usize].coords);
             let within = a * 0.6 + c * 0.4;
-            // From inside a quad or the corner of a ring, a small step must end in air.
+            // A small step along the normal from a point of the surface must end in air.
             let at = match surface.loops.len() {
                 1 => within + surface.normal * 0.05,
-                _ => mesh.vertices[ring[0] as usize].coords + surface.normal * 0.05 + Vector3::new(0.0, 0.05, 0.05),
+                _ => {
+                    mesh.vertices[ring[0] as usize].coords
+                        + surface.normal * 0.05
+                        + Vector3::new(0.0, 0.05, 0.05)
+                }
             };
-            assert!((0.0..=corridor.length_m).contains(&at.x) && at.y.abs() <= 3.0 && (0.0..=7.0).contains(&at.z));
+            assert!(
+                (0.0..=corridor.length_m).contains(&at.x)
+                    && at.y.abs() <= 3.0
+                    && (0.0..=7.0).contains(&at.z)
+            );
             let in_wall = course.walls().iter().any(|wall| {
                 (wall.x_m()..wall.x_m() + course.wall_thickness_m()).contains(&at.x)
                     && super::super::polygon::signed_distance(wall.outline(), [at.y, at.z]) < 0.0
@@ -206,7 +223,7 @@ mod tests {
             let normal = mesh.triangle_normal(triangle);
             assert!(
                 normal.dot(&mesh.surfaces[surface].normal) > 0.0,
-                "triangle faces the wrong way"
+                "the triangle faces the wrong way"
             );
             areas[surface] += normal.norm() / 2.0;
         }

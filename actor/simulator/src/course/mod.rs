@@ -1,10 +1,11 @@
-//! The corridor, its walls and their openings, in flight order.
+//! Courses: a corridor, its walls and their openings, in the order in which the drone meets them.
 //!
-//! A [`Course`] that exists can be flown: [`Course::new`] refuses everything else with the wall, the key and the remedy, so
-//! neither the physics nor the camera has to ask again. The same [`Mesh`] of surfaces is what the drone sees and what it
-//! hits.
+//! Every [`Course`] can be flown: [`Course::new`] refuses anything else and names the wall, the key
+//! and the remedy. So neither the physics nor the camera checks again. The drone sees and hits the
+//! same mesh of surfaces.
 //!
-//! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the floor; metres.
+//! World frame: x forward along the corridor from 0, y to the left from the middle, z up from the
+//! floor; metres.
 
 mod check;
 mod fault;
@@ -13,7 +14,7 @@ mod generator;
 mod mesh;
 mod opening;
 mod polygon;
-mod whereabouts;
+mod source_location;
 
 use std::fmt;
 
@@ -21,20 +22,22 @@ use nalgebra::Point3;
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 
-pub use fault::{CourseFault, NoSuchLevel, Place};
+pub use fault::{CourseFault, FaultLocation, NoSuchLevel};
 pub use file::CourseError;
 pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
-pub use mesh::{Mesh, Surface, SurfaceKind};
+pub(crate) use mesh::{Mesh, MeshSurface, SurfaceKind};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
 
-/// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x 0.98 x 0.29 m.
+/// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x
+/// 0.98 x 0.29 m.
 pub const DRONE_WIDTH_M: f32 = 0.98;
 
-/// Radius about an opening's safe point that must be free, metres: half the diagonal of the drone's cross-section
-/// 0.98 x 0.29 m, which is 0.511 m however the body rolls, and 0.14 m for the pilot's error.
+/// Radius around an opening's safe point that must be free, metres. Half the diagonal of the
+/// drone's cross-section, 0.98 x 0.29 m, is 0.511 m at any roll angle; 0.14 m is for the policy's
+/// error.
 pub const BODY_CLEARANCE_M: f32 = 0.65;
 
-/// Least width of the frame that remains around an opening, metres.
+/// Least width of the wall's frame around an opening, metres.
 pub const FRAME_M: f32 = 0.1;
 
 /// Most corners of a polygon opening.
@@ -43,7 +46,7 @@ pub const MAX_CORNERS: usize = 64;
 /// Most walls of a course.
 pub const MAX_WALLS: usize = 32;
 
-/// The number a wall is known by in course files and reports, whatever its place in the order.
+/// Number that names a wall in course files and reports, independent of its place in the order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct WallLabel(pub u32);
@@ -58,7 +61,7 @@ impl fmt::Display for WallLabel {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Corridor {
-    /// Along x, metres. Reaching its end wall is the destination.
+    /// Along x, metres. The end wall is the destination.
     pub length_m: f32,
     /// Along y, metres.
     pub width_m: f32,
@@ -67,7 +70,7 @@ pub struct Corridor {
 }
 
 impl Default for Corridor {
-    /// The paper's: 60 x 6 x 7 m.
+    /// The paper's corridor: 60 x 6 x 7 m.
     fn default() -> Self {
         Self {
             length_m: 60.0,
@@ -77,11 +80,12 @@ impl Default for Corridor {
     }
 }
 
-/// Where flights begin: this far behind the previous wall's front face, in the middle of the corridor, give or take.
+/// Area in which episodes start: a fixed distance behind the previous wall's front face, around the
+/// middle of the corridor.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StartArea {
-    /// Behind the front face of the wall before (or the corridor's start), metres.
+    /// Distance behind the previous wall's front face (or the corridor's start), metres.
     pub offset_m: f32,
     /// Largest deviation from the middle along y, metres; drawn uniformly.
     pub jitter_y_m: f32,
@@ -90,7 +94,8 @@ pub struct StartArea {
 }
 
 impl Default for StartArea {
-    /// 1.5 m clears a wall of 0.3 m by more than the drone's half length; 0.5 m makes every flight another flight.
+    /// An offset of 1.5 m clears a wall of 0.3 m by more than half the drone's length; a jitter of
+    /// 0.5 m makes every episode different.
     fn default() -> Self {
         Self {
             offset_m: 1.5,
@@ -100,29 +105,29 @@ impl Default for StartArea {
     }
 }
 
-/// What a course is made of, before it is checked.
+/// Description of a course before it is checked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CourseLayout {
-    /// Name in reports.
+    /// Name for reports.
     pub name: String,
     /// The corridor.
     pub corridor: Corridor,
-    /// Where flights begin.
+    /// Area in which episodes start.
     pub start: StartArea,
     /// Thickness of every wall along x, metres.
     pub wall_thickness_m: f32,
-    /// Walls in flight order.
+    /// Walls in course order.
     pub walls: Vec<WallLayout>,
 }
 
-/// A wall before it is checked.
+/// Description of a wall before it is checked.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WallLayout {
     /// The wall's number.
     pub label: WallLabel,
-    /// Its front face (the one met first), metres.
+    /// Position of its front face, which the drone meets first, metres.
     pub x_m: f32,
-    /// Its hole.
+    /// Its opening.
     pub opening: Opening,
 }
 
@@ -137,7 +142,7 @@ pub struct Wall {
     clearance_m: f32,
 }
 
-/// A corridor with walls that can be flown from its start to its end wall.
+/// A corridor with walls that the drone can fly from the start to the end wall.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Course {
     name: String,
@@ -148,12 +153,17 @@ pub struct Course {
 }
 
 impl Course {
-    /// Checks a layout and makes it a course.
+    /// Checks a layout and turns it into a course.
     ///
     /// # Errors
-    /// The first [`CourseFault`] found, from the corridor to the walls in flight order.
+    /// The first [`CourseFault`] found, from the corridor to the walls in course order.
     pub fn new(layout: CourseLayout) -> Result<Self, CourseFault> {
-        let mut course = Self::without_walls(layout.name, layout.corridor, layout.start, layout.wall_thickness_m)?;
+        let mut course = Self::without_walls(
+            layout.name,
+            layout.corridor,
+            layout.start,
+            layout.wall_thickness_m,
+        )?;
         check::wall_count(layout.walls.len())?;
         for wall in layout.walls {
             course.add_wall(wall)?;
@@ -161,7 +171,7 @@ impl Course {
         Ok(course)
     }
 
-    /// A course under construction.
+    /// Returns a course without walls, to which [`Self::add_wall`] adds them.
     fn without_walls(
         name: String,
         corridor: Corridor,
@@ -179,27 +189,36 @@ impl Course {
         Ok(course)
     }
 
-    /// Adds the next wall in flight order, unless it cannot be flown.
+    /// Adds the next wall in course order if it can be flown.
     fn add_wall(&mut self, layout: WallLayout) -> Result<(), CourseFault> {
         let wall = check::next_wall(self, layout)?;
         self.walls.push(wall);
         Ok(())
     }
 
-    /// The same walls at the same places, in another order: `order` holds the place, from 0, of the wall that comes first, second, and so on.
+    /// Returns a course with the same walls in another order. `order` holds the current place, from
+    /// 0, of the wall that comes first, second, and so on; the positions along x stay the same.
     ///
     /// # Errors
-    /// The first [`CourseFault`], from the first wall on: not every order leaves way enough from one opening to the next.
+    /// The first [`CourseFault`], from the first wall on: not every order leaves enough distance
+    /// from one opening to the next.
     ///
     /// # Panics
-    /// If `order` is no permutation of the walls' places.
-    pub fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
-        assert_eq!(order.len(), self.walls.len(), "an order names each wall once");
-        let walls = order.iter().zip(&self.walls).map(|(&from, place)| WallLayout {
-            label: self.walls[from].label,
-            x_m: place.x_m,
-            opening: self.walls[from].opening.clone(),
-        });
+    /// If `order` is not a permutation of the walls' places.
+    pub(crate) fn reordered(&self, order: &[usize]) -> Result<Self, CourseFault> {
+        assert_eq!(
+            order.len(),
+            self.walls.len(),
+            "an order names each wall once"
+        );
+        let walls = order
+            .iter()
+            .zip(&self.walls)
+            .map(|(&from, place)| WallLayout {
+                label: self.walls[from].label,
+                x_m: place.x_m,
+                opening: self.walls[from].opening.clone(),
+            });
         Self::new(CourseLayout {
             name: self.name.clone(),
             corridor: self.corridor,
@@ -209,48 +228,54 @@ impl Course {
         })
     }
 
-    /// Name in reports.
+    /// Returns the name for reports.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Inner size of the corridor.
+    /// Returns the inner size of the corridor.
     #[must_use]
     pub fn corridor(&self) -> Corridor {
         self.corridor
     }
 
-    /// Where flights begin.
+    /// Returns the area in which episodes start.
     #[must_use]
     pub fn start(&self) -> StartArea {
         self.start
     }
 
-    /// Thickness of every wall along x, metres: a wall fills `x_m .. x_m + wall_thickness_m`.
+    /// Returns the thickness of every wall along x, metres: a wall fills `x_m .. x_m +
+    /// wall_thickness_m`.
     #[must_use]
     pub fn wall_thickness_m(&self) -> f32 {
         self.wall_thickness_m
     }
 
-    /// The walls in flight order.
+    /// Returns the walls in course order.
     #[must_use]
     pub fn walls(&self) -> &[Wall] {
         &self.walls
     }
 
-    /// Number of start levels: one before each wall.
+    /// Returns the number of start levels: one before each wall.
     #[must_use]
     pub fn levels(&self) -> u8 {
         // `new` allows at most MAX_WALLS.
         self.walls.len() as u8
     }
 
-    /// Draws where a flight of `level` (1 = before the first wall) begins, in the world frame, metres.
+    /// Draws the start position of an episode of `level` (1 = before the first wall), world frame,
+    /// metres.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn start_position(&self, level: u8, rng: &mut impl Rng) -> Result<Point3<f32>, NoSuchLevel> {
+    pub(crate) fn start_position(
+        &self,
+        level: u8,
+        rng: &mut impl Rng,
+    ) -> Result<Point3<f32>, NoSuchLevel> {
         let levels = self.levels();
         if !(1..=levels).contains(&level) {
             return Err(NoSuchLevel { level, levels });
@@ -271,52 +296,53 @@ impl Course {
         ))
     }
 
-    /// All surfaces of the course, from the inside.
-    #[must_use]
-    pub fn mesh(&self) -> Mesh {
+    /// Returns all surfaces of the course, seen from the inside.
+    pub(crate) fn mesh(&self) -> Mesh {
         Mesh::of(self)
     }
 }
 
 impl Wall {
-    /// The wall's number, whatever its place in the order.
+    /// Returns the wall's number, independent of its place in the order.
     #[must_use]
     pub fn label(&self) -> WallLabel {
         self.label
     }
 
-    /// The front face, which the drone meets first, metres along the corridor.
+    /// Returns the position of the front face, which the drone meets first, metres.
     #[must_use]
     pub fn x_m(&self) -> f32 {
         self.x_m
     }
 
-    /// The hole as it was described.
+    /// Returns the opening as described.
     #[must_use]
     pub fn opening(&self) -> &Opening {
         &self.opening
     }
 
-    /// The hole's corners `[y, z]` in metres, counter-clockwise with y to the right and z up.
+    /// Returns the opening's corners `[y, z]` in metres, counter-clockwise with y to the right and
+    /// z up.
     #[must_use]
     pub fn outline(&self) -> &[[f32; 2]] {
         &self.outline
     }
 
-    /// Where to fly through: the centre `[y, z]` of the widest circle inside the opening, metres.
+    /// Returns the point to fly through: the centre `[y, z]` of the widest circle inside the
+    /// opening, metres.
     #[must_use]
     pub fn safe_point(&self) -> [f32; 2] {
         self.safe_point
     }
 
-    /// Radius of the widest circle inside the opening, metres.
+    /// Returns the radius of the widest circle inside the opening, metres.
     #[must_use]
     pub fn clearance_m(&self) -> f32 {
         self.clearance_m
     }
 }
 
-/// One wall of each kind of opening, for the tests of this crate.
+/// Returns a course with one wall per kind of opening, for the tests of this crate.
 #[cfg(test)]
 pub(crate) fn test_course() -> Course {
     let square = Shape::Rectangle {
@@ -373,5 +399,5 @@ pub(crate) fn test_course() -> Course {
         wall_thickness_m: 0.3,
         walls,
     })
-    .expect("the course of the tests can be flown")
+    .expect("the test course can be flown")
 }

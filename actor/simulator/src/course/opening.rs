@@ -1,24 +1,27 @@
-//! The hole in a wall: a shape, where its middle lies, how far it is turned.
+//! The opening in a wall: a shape, its centre and its rotation.
 //!
-//! Whatever the shape, the rest of the crate sees one thing: a simple polygon in the wall's plane.
+//! The rest of the crate sees every shape as a simple polygon in the wall's plane.
 
 use super::polygon;
 
-/// Sides of the regular polygon that stands for a circle: it deviates from the true circle by 0.5 % of the radius.
+/// Number of sides of the regular polygon that stands for a circle. It deviates from the circle by
+/// 0.5 % of the radius.
 pub const CIRCLE_SIDES: usize = 32;
 
-/// An opening in a wall's plane. Coordinates are `[y, z]` in metres, as in the world frame: y to the left, z up.
+/// An opening in a wall's plane. Coordinates are `[y, z]` in metres, as in the world frame: y to
+/// the left, z up.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Opening {
-    /// What is cut out.
+    /// Shape of the opening.
     pub shape: Shape,
-    /// Where the middle of the shape's bounding box lies (the origin of `points_m` for a polygon), `[y, z]` in metres.
+    /// Middle of the shape's bounding box (for a polygon, the origin of `points_m`), `[y, z]` in
+    /// metres.
     pub centre_m: [f32; 2],
-    /// Turn about the centre from y towards z, degrees.
+    /// Rotation about the centre from y towards z, degrees.
     pub rotation_deg: f32,
 }
 
-/// What is cut out of a wall, before it is turned and moved. Lengths in metres.
+/// Shape of an opening before it is rotated and moved. Lengths are in metres.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
     /// Axis-parallel rectangle.
@@ -28,9 +31,9 @@ pub enum Shape {
         /// Along z.
         height_m: f32,
     },
-    /// Circle, cut as a polygon of [`CIRCLE_SIDES`] corners.
+    /// Circle, approximated by a polygon of [`CIRCLE_SIDES`] corners.
     Circle {
-        /// Through opposite corners of that polygon.
+        /// Distance between opposite corners of that polygon.
         diameter_m: f32,
     },
     /// Isosceles triangle standing on its base.
@@ -47,7 +50,7 @@ pub enum Shape {
         /// The diagonal along z.
         height_m: f32,
     },
-    /// An upright and a level beam crossing in the middle.
+    /// An upright and a level beam that cross in the middle.
     Cross {
         /// Along y.
         width_m: f32,
@@ -56,7 +59,8 @@ pub enum Shape {
         /// Thickness of both beams.
         arm_m: f32,
     },
-    /// An upright beam at the least y and a level one at the bottom, as the letter reads with y to the right.
+    /// An upright beam at the least y and a level beam at the bottom: the letter L with y to the
+    /// right.
     L {
         /// Along y.
         width_m: f32,
@@ -65,15 +69,15 @@ pub enum Shape {
         /// Thickness of both beams.
         arm_m: f32,
     },
-    /// Any simple polygon.
+    /// A simple polygon.
     Polygon {
-        /// Corners `[y, z]` relative to the centre, in either sense of rotation.
+        /// Corners `[y, z]` relative to the centre, clockwise or counter-clockwise.
         points_m: Vec<[f32; 2]>,
     },
 }
 
 impl Opening {
-    /// Corners `[y, z]` in metres, counter-clockwise with y to the right and z up.
+    /// Returns the corners `[y, z]` in metres, counter-clockwise with y to the right and z up.
     #[must_use]
     pub fn outline(&self) -> Vec<[f32; 2]> {
         let (sin, cos) = self.rotation_deg.to_radians().sin_cos();
@@ -90,7 +94,7 @@ impl Opening {
 }
 
 impl Shape {
-    /// The shape's name in course files.
+    /// Returns the shape's name in course files.
     #[must_use]
     pub fn name(&self) -> &'static str {
         match self {
@@ -104,7 +108,7 @@ impl Shape {
         }
     }
 
-    /// The lengths that make up the shape, by the key that sets them. A polygon has none.
+    /// Returns the shape's lengths with the keys that set them. A polygon has none.
     pub(crate) fn lengths_m(&self) -> Vec<(&'static str, f32)> {
         match *self {
             Self::Rectangle { width_m, height_m }
@@ -123,13 +127,17 @@ impl Shape {
                 height_m,
                 arm_m,
             } => {
-                vec![("width_m", width_m), ("height_m", height_m), ("arm_m", arm_m)]
+                vec![
+                    ("width_m", width_m),
+                    ("height_m", height_m),
+                    ("arm_m", arm_m),
+                ]
             }
             Self::Polygon { .. } => Vec::new(),
         }
     }
 
-    /// The same shape, `factor` times as large.
+    /// Returns the same shape, `factor` times as large.
     pub(crate) fn scaled(mut self, factor: f32) -> Self {
         match &mut self {
             Self::Rectangle { width_m, height_m }
@@ -153,12 +161,15 @@ impl Shape {
                 *height_m *= factor;
                 *arm_m *= factor;
             }
-            Self::Polygon { points_m } => points_m.iter_mut().flatten().for_each(|value| *value *= factor),
+            Self::Polygon { points_m } => points_m
+                .iter_mut()
+                .flatten()
+                .for_each(|value| *value *= factor),
         }
         self
     }
 
-    /// Corners about the origin.
+    /// Returns the corners relative to the centre.
     fn corners(&self) -> Vec<[f32; 2]> {
         match *self {
             Self::Rectangle { width_m, height_m } => {
@@ -168,7 +179,10 @@ impl Shape {
             Self::Circle { diameter_m } => (0..CIRCLE_SIDES)
                 .map(|side| {
                     let angle = side as f32 / CIRCLE_SIDES as f32 * std::f32::consts::TAU;
-                    [diameter_m / 2.0 * angle.cos(), diameter_m / 2.0 * angle.sin()]
+                    [
+                        diameter_m / 2.0 * angle.cos(),
+                        diameter_m / 2.0 * angle.sin(),
+                    ]
                 })
                 .collect(),
             Self::Triangle { width_m, height_m } => {
@@ -234,10 +248,12 @@ mod tests {
     }
 
     #[test]
-    fn areas_are_those_of_the_textbook() {
+    fn areas_equal_those_of_the_textbook() {
         for turn in [0.0, 33.0, -190.0] {
             let (width_m, height_m, arm_m) = (3.0, 2.0, 0.5);
-            let near = |got: f32, expected: f32| assert!((got - expected).abs() < 1e-4, "{got} {expected}");
+            let near = |got: f32, expected: f32| {
+                assert!((got - expected).abs() < 1e-4, "{got} {expected}")
+            };
             near(area(Shape::Rectangle { width_m, height_m }, turn), 6.0);
             near(area(Shape::Triangle { width_m, height_m }, turn), 3.0);
             near(area(Shape::Diamond { width_m, height_m }, turn), 3.0);
@@ -269,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clockwise_polygon_is_turned_round() {
+    fn a_clockwise_polygon_is_reversed() {
         let points_m = vec![[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]];
         assert!((area(Shape::Polygon { points_m }, 0.0) - 0.5).abs() < 1e-6);
     }

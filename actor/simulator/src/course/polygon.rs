@@ -1,15 +1,18 @@
-//! Simple polygons in a wall's plane: orientation, self-intersection, and the widest free spot.
+//! Simple polygons in a wall's plane: orientation, self-intersection, widest inner circle.
 //!
-//! Points are `[y, z]` in metres. Everything here is plain arithmetic on a handful of points, so it is written out rather
-//! than brought in.
+//! Points are `[y, z]` in metres. This is plain arithmetic on a few points, so it needs no
+//! dependency.
 
-/// Twice-signed area halved: positive when the points run counter-clockwise.
+/// Returns the signed area, m²: positive if the points run counter-clockwise.
 pub(crate) fn signed_area(points: &[[f32; 2]]) -> f32 {
-    edges(points).map(|([ay, az], [by, bz])| ay * bz - by * az).sum::<f32>() * 0.5
+    edges(points)
+        .map(|([ay, az], [by, bz])| ay * bz - by * az)
+        .sum::<f32>()
+        * 0.5
 }
 
-/// The area's centre of gravity. `points`: a polygon of non-zero area.
-pub(crate) fn centroid(points: &[[f32; 2]]) -> [f32; 2] {
+/// Returns the centroid of a polygon with non-zero area.
+fn centroid(points: &[[f32; 2]]) -> [f32; 2] {
     let mut sum = [0.0; 2];
     for ([ay, az], [by, bz]) in edges(points) {
         let cross = ay * bz - by * az;
@@ -20,7 +23,8 @@ pub(crate) fn centroid(points: &[[f32; 2]]) -> [f32; 2] {
     [sum[0] * scale, sum[1] * scale]
 }
 
-/// The first pair of edges (by number) that touch although they are not neighbours, or that fold back on each other.
+/// Returns the numbers of the first two edges that touch without being neighbours, or that fold
+/// back on each other.
 pub(crate) fn self_intersection(points: &[[f32; 2]]) -> Option<(usize, usize)> {
     let sides: Vec<_> = edges(points).collect();
     let count = sides.len();
@@ -41,7 +45,7 @@ pub(crate) fn self_intersection(points: &[[f32; 2]]) -> Option<(usize, usize)> {
     None
 }
 
-/// Distance from `point` to the nearest edge: positive inside, negative outside.
+/// Returns the distance from `point` to the nearest edge: positive inside, negative outside.
 pub(crate) fn signed_distance(points: &[[f32; 2]], point: [f32; 2]) -> f32 {
     let mut inside = false;
     let mut nearest = f32::INFINITY;
@@ -55,15 +59,16 @@ pub(crate) fn signed_distance(points: &[[f32; 2]], point: [f32; 2]) -> f32 {
     if inside { nearest } else { -nearest }
 }
 
-/// Centre of the widest circle that fits inside, and its radius in metres, to a millimetre.
+/// Returns the centre and the radius of the widest circle that fits inside, to a millimetre.
 ///
-/// Where several circles are equally wide (a long rectangle), the one nearest the centroid wins: an opening is flown
-/// through its middle. Squares are quartered as long as a better centre can lie in them.
+/// If several circles are equally wide (a long rectangle), the one nearest to the centroid wins: an
+/// opening is flown through its middle. The search divides squares into quarters as long as they
+/// can hold a better centre.
 pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
-    /// Metres of clearance given up for each metre nearer to the centroid.
+    /// Metres of clearance worth one metre nearer to the centroid.
     const PULL_TO_CENTROID: f32 = 0.02;
     const PRECISION_M: f32 = 0.001;
-    /// How much the score can change over a metre.
+    /// Largest change of the score over a metre.
     const STEEPEST: f32 = 1.0 + PULL_TO_CENTROID;
 
     let middle = centroid(points);
@@ -80,7 +85,10 @@ pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
     let mut squares = vec![middle];
     while !squares.is_empty() {
         let scored: Vec<_> = squares.into_iter().map(|at| (at, score(at))).collect();
-        best = scored.iter().copied().fold(best, |a, b| if b.1 > a.1 { b } else { a });
+        best = scored
+            .iter()
+            .copied()
+            .fold(best, |a, b| if b.1 > a.1 { b } else { a });
         let corner_gains = half_side * std::f32::consts::SQRT_2 * STEEPEST;
         half_side /= 2.0;
         squares = scored
@@ -96,13 +104,13 @@ pub(crate) fn widest_circle(points: &[[f32; 2]]) -> ([f32; 2], f32) {
     (best.0, signed_distance(points, best.0))
 }
 
-/// Edges in order, the last one closing the loop.
+/// Returns the edges in order; the last one closes the loop.
 pub(crate) fn edges(points: &[[f32; 2]]) -> impl Iterator<Item = ([f32; 2], [f32; 2])> + '_ {
     let next = points.iter().cycle().skip(1);
     points.iter().copied().zip(next.copied())
 }
 
-/// `b` lies between `a` and `c` on their way back: the edges `a b` and `b c` cover each other.
+/// Returns `true` if the path `a b c` reverses at `b`: the edges `a b` and `b c` cover each other.
 fn folds_back(a: [f32; 2], b: [f32; 2], c: [f32; 2]) -> bool {
     let along = (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]);
     turn(a, b, c) == 0.0 && along <= 0.0
@@ -120,7 +128,7 @@ fn segments_touch((a, b): ([f32; 2], [f32; 2]), (c, d): ([f32; 2], [f32; 2])) ->
         || (cdb == 0.0 && in_box(c, d, b))
 }
 
-/// Positive where `a`, `b`, `c` turn left.
+/// Returns a positive number if the path `a b c` turns left.
 fn turn(a: [f32; 2], b: [f32; 2], c: [f32; 2]) -> f32 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 }
@@ -151,7 +159,10 @@ mod tests {
     fn widest_circle_of_a_square_is_its_incircle() {
         let (centre, radius) = widest_circle(&SQUARE);
         assert!((radius - 1.0).abs() < 2e-3, "{radius}");
-        assert!((centre[0] - 1.0).hypot(centre[1] - 1.0) < 2e-3, "{centre:?}");
+        assert!(
+            (centre[0] - 1.0).hypot(centre[1] - 1.0) < 2e-3,
+            "{centre:?}"
+        );
     }
 
     #[test]
@@ -162,11 +173,21 @@ mod tests {
 
     #[test]
     fn widest_circle_of_an_l_lies_in_its_corner() {
-        let l = [[0.0, 0.0], [3.0, 0.0], [3.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]];
+        let l = [
+            [0.0, 0.0],
+            [3.0, 0.0],
+            [3.0, 1.0],
+            [1.0, 1.0],
+            [1.0, 3.0],
+            [0.0, 3.0],
+        ];
         let (centre, radius) = widest_circle(&l);
         // The circle touches both outer sides and the inner corner: r = (1 - r) * sqrt 2.
         let expected = 2f32.sqrt() / (1.0 + 2f32.sqrt());
-        assert!((radius - expected).abs() < 5e-3, "{radius} against {expected}");
+        assert!(
+            (radius - expected).abs() < 5e-3,
+            "{radius} against {expected}"
+        );
         assert!((centre[0] - centre[1]).abs() < 5e-3);
     }
 

@@ -2,36 +2,37 @@
 
 use std::collections::VecDeque;
 
-/// Holds each action back for a number of control periods. Until the first one arrives, nothing is commanded sideways or up.
+/// Queue that delays each action by a number of control periods. Until the first action arrives,
+/// the command sideways and up is zero.
 #[derive(Debug, Clone)]
-pub(crate) struct Delay {
-    on_the_way: VecDeque<[f32; 2]>,
+pub(crate) struct CommandDelay {
+    pending: VecDeque<[f32; 2]>,
 }
 
-impl Delay {
-    /// A way of `periods` control periods on which nothing is yet.
+impl CommandDelay {
+    /// Returns a delay of `periods` control periods without pending actions.
     pub(crate) fn new(periods: u32) -> Self {
         let mut delay = Self {
-            on_the_way: VecDeque::with_capacity(periods as usize + 1),
+            pending: VecDeque::with_capacity(periods as usize + 1),
         };
         delay.begin(periods);
         delay
     }
 
-    /// Forgets what was on the way, which takes `periods` from now on.
+    /// Discards all pending actions and delays the following ones by `periods`.
     pub(crate) fn begin(&mut self, periods: u32) {
-        self.on_the_way.clear();
-        self.on_the_way.resize(periods as usize, [0.0, 0.0]);
+        self.pending.clear();
+        self.pending.resize(periods as usize, [0.0, 0.0]);
     }
 
-    /// Control periods until a command takes effect.
+    /// Returns the number of control periods until a command takes effect.
     pub(crate) fn periods(&self) -> usize {
-        self.on_the_way.len()
+        self.pending.len()
     }
 
-    /// Takes `action` in and gives the one out that takes effect now.
+    /// Queues `action` and returns the action that takes effect now.
     pub(crate) fn pass(&mut self, action: [f32; 2]) -> [f32; 2] {
-        self.on_the_way.push_back(action);
-        self.on_the_way.pop_front().unwrap_or(action)
+        self.pending.push_back(action);
+        self.pending.pop_front().unwrap_or(action)
     }
 }

@@ -1,8 +1,10 @@
-//! What a flight meets that the policy did not ask for: a noisy depth camera, gusts, late commands, a drone of another mass.
+//! Disturbances of an episode: a noisy depth camera, gusts, late commands, a different mass.
 //!
-//! Each can be switched on alone, all are off by default, and off they change no bit of a flight. What is drawn is drawn from a generator that
-//! [`Simulator::reset`](crate::simulator::Simulator::reset) takes, so that a disturbed flight is as repeatable as a calm one. Draws do not shift each other:
-//! the mass of a flight is the same whether or not there are gusts.
+//! Each can be switched on alone. All are off by default, and then they change no bit of an
+//! episode. All random draws come from the generator given to
+//! [`Simulator::reset`](crate::simulator::Simulator::reset), so that a disturbed episode is as
+//! repeatable as a calm one. Draws do not shift each other: the mass of an episode is the same with
+//! and without gusts.
 
 mod delay;
 mod gust;
@@ -13,26 +15,28 @@ mod tests;
 
 use rand::{Rng, RngExt};
 
-pub(crate) use delay::Delay;
+pub(crate) use delay::CommandDelay;
 pub(crate) use gust::Gust;
 pub(crate) use normal::{mix, scrambled, standard_normal};
-pub use settings::{DepthModel, DepthNoiseSettings, DisturbanceFault, DisturbanceSettings, GustSettings};
+pub use settings::{
+    DepthModel, DepthNoiseSettings, DisturbanceSettings, DisturbanceSettingsError, GustSettings,
+};
 
-/// What was drawn for one flight.
+/// Disturbances drawn for one episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Drawn {
-    /// Whether it is disturbed at all.
+pub(crate) struct DrawnDisturbances {
+    /// `false` if the episode is calm.
     pub(crate) disturbed: bool,
-    /// Mass and inertia of the body, as a share of what they nominally are.
+    /// Mass and inertia of the body relative to their nominal values.
     pub(crate) mass_factor: f32,
-    /// Seed of its gusts.
+    /// Seed of the gusts.
     pub(crate) gust_seed: u64,
-    /// Seed of what its camera gets wrong.
+    /// Seed of the camera's errors.
     pub(crate) depth_seed: u64,
 }
 
-impl Drawn {
-    /// Draws for one flight, always as much and in the same order.
+impl DrawnDisturbances {
+    /// Draws for one episode: always the same number of values in the same order.
     pub(crate) fn draw(settings: &DisturbanceSettings, rng: &mut impl Rng) -> Self {
         let deviation: f32 = rng.random_range(-1.0..=1.0);
         let [gust_seed, depth_seed] = [rng.random(), rng.random()];

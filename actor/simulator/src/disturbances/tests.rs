@@ -1,4 +1,4 @@
-//! Disturbed flights: what each disturbance does to the drone, and that none does anything when it is off.
+//! Disturbed episodes: each disturbance has its effect when it is on and none when it is off.
 
 use std::sync::Arc;
 
@@ -10,13 +10,14 @@ use super::*;
 use crate::camera::{CameraSettings, IMAGE_PIXELS};
 use crate::course::{Course, test_course};
 use crate::oracle::Oracle;
-use crate::simulator::{Outcome, Simulator, SimulatorSettings};
+use crate::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use crate::vehicle::{Preset, VehicleSettings, VehicleState};
 
-/// Everything at once, strongly.
+/// Returns all disturbances at once, and strong.
 fn stormy() -> DisturbanceSettings {
     toml::from_str(
-        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\ndepth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
+        "mass_spread = 0.2\nlatency_periods = 1\ngust.force_rms_n = 0.15\n\
+         depth.model = \"stereo\"\ndepth.dropout_share = 0.1\n",
     )
     .unwrap()
 }
@@ -37,18 +38,18 @@ fn simulator(preset: Preset, disturbances: DisturbanceSettings) -> Simulator {
     Simulator::new(Arc::new(test_course()), &settings).unwrap()
 }
 
-fn take_off(simulator: &mut Simulator, disturbances_seed: u64) {
+fn reset(simulator: &mut Simulator, disturbances_seed: u64) {
     let [mut start, mut disturbances] = [1, disturbances_seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances).unwrap();
 }
 
-/// State and image before each step of `actions`, and after the last.
+/// Returns state and image before each step of `actions`, and after the last.
 fn flown(
     simulator: &mut Simulator,
     disturbances_seed: u64,
     actions: &[[f32; 2]],
 ) -> Vec<(VehicleState, Box<[u8; IMAGE_PIXELS]>)> {
-    take_off(simulator, disturbances_seed);
+    reset(simulator, disturbances_seed);
     let look = |simulator: &mut Simulator| {
         let mut image = Box::new([0; IMAGE_PIXELS]);
         simulator.render(&mut image);
@@ -63,7 +64,7 @@ fn flown(
 }
 
 #[test]
-fn disturbed_flight_is_a_function_of_its_seeds_whatever_was_flown_before() {
+fn a_disturbed_episode_depends_on_its_seeds_and_not_on_earlier_episodes() {
     let actions = [[0.5, 0.2]; 8];
     let mut used = simulator(Preset::Airsim, stormy());
     let first = flown(&mut used, 5, &actions);
@@ -75,14 +76,19 @@ fn disturbed_flight_is_a_function_of_its_seeds_whatever_was_flown_before() {
 }
 
 #[test]
-fn share_of_flights_is_disturbed_and_the_others_are_calm_in_every_respect() {
+fn a_share_of_episodes_is_disturbed_and_the_others_are_calm_in_every_respect() {
     let actions = [[0.5, 0.2]; 4];
-    let now_and_then = DisturbanceSettings { share: 0.3, ..stormy() };
+    let now_and_then = DisturbanceSettings {
+        share: 0.3,
+        ..stormy()
+    };
     let mut simulators = [DisturbanceSettings::default(), stormy(), now_and_then]
         .map(|disturbances| simulator(Preset::Airsim, disturbances));
     let mut disturbed = 0;
     for seed in 0..100 {
-        let [calm, stormy, found] = simulators.each_mut().map(|simulator| flown(simulator, seed, &actions));
+        let [calm, stormy, found] = simulators
+            .each_mut()
+            .map(|simulator| flown(simulator, seed, &actions));
         assert!(found == calm || found == stormy, "seed {seed}");
         disturbed += usize::from(found == stormy);
     }
@@ -91,7 +97,7 @@ fn share_of_flights_is_disturbed_and_the_others_are_calm_in_every_respect() {
 }
 
 #[test]
-fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
+fn the_disturbances_generator_has_no_influence_with_disturbances_off() {
     let actions = [[0.5, 0.2]; 8];
     for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
         let mut calm = simulator(preset, DisturbanceSettings::default());
@@ -102,11 +108,15 @@ fn calm_settings_leave_no_trace_of_the_disturbances_generator() {
     }
 }
 
-/// The oracle's flights from seed 1 to where they leave the last wall behind, as they were before there were disturbances: then, flights were equal bit for bit.
-/// Here positions are held to a millimetre and sums to a part in 10,000, because mathematical functions may differ in the last bit from one system's library to another's.
+/// Compares the oracle's episode from seed 1, up to its last wall, with one recorded before
+/// disturbances existed. Positions may differ by a millimetre and sums by a part in 10,000, because
+/// mathematical functions of different system libraries may differ in the last bit.
 #[test]
-fn undisturbed_flights_are_those_from_before_there_were_disturbances() {
-    let course = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/courses/training.toml");
+fn undisturbed_episodes_equal_those_recorded_before_disturbances_existed() {
+    let course = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../configs/courses/training.toml"
+    );
     let course = Arc::new(Course::load(course).unwrap());
     for (preset, steps, end_m, grey) in RECORDED {
         let settings = SimulatorSettings {
@@ -114,7 +124,7 @@ fn undisturbed_flights_are_those_from_before_there_were_disturbances() {
             ..Default::default()
         };
         let mut simulator = Simulator::new(Arc::clone(&course), &settings).unwrap();
-        take_off(&mut simulator, 3);
+        reset(&mut simulator, 3);
         let mut image = [0; IMAGE_PIXELS];
         let (mut flown, mut sum) = (0, 0.0);
         while simulator.walls_passed() < 5 {
@@ -126,21 +136,46 @@ fn undisturbed_flights_are_those_from_before_there_were_disturbances() {
         }
         let end = simulator.state().position_m.coords;
         assert_eq!(flown, steps, "{preset:?}");
-        assert!((end - Vector3::from(end_m)).norm() < 1e-3, "{preset:?}: {end}");
+        assert!(
+            (end - Vector3::from(end_m)).norm() < 1e-3,
+            "{preset:?}: {end}"
+        );
         assert!((sum / grey - 1.0).abs() < 1e-4, "{preset:?}: {sum}");
     }
 }
 
-/// Steps, position at the end in metres, sum of all pixels.
+/// Steps, final position in metres, sum of all pixels.
 const RECORDED: [(Preset, u32, [f32; 3], f64); 3] = [
-    (Preset::Airsim, 100, [50.321_125, 1.700_952, 2.916_062], 60_939_195.0),
-    (Preset::Hummingbird, 99, [50.454_193, 1.691_67, 2.912_474], 60_432_945.0),
-    (Preset::Point, 99, [50.704_067, 1.689_485, 2.905_335], 60_359_220.0),
+    (
+        Preset::Airsim,
+        100,
+        [50.321_125, 1.700_952, 2.916_062],
+        60_939_195.0,
+    ),
+    (
+        Preset::Hummingbird,
+        99,
+        [50.454_193, 1.691_67, 2.912_474],
+        60_432_945.0,
+    ),
+    (
+        Preset::Point,
+        99,
+        [50.704_067, 1.689_485, 2.905_335],
+        60_359_220.0,
+    ),
 ];
 
 #[test]
-fn latency_shifts_the_answer_by_exactly_its_periods() {
-    let actions = [[0.8, -0.4], [-0.3, 0.6], [0.1, 0.1], [1.0, 0.0], [0.0, 0.5], [0.2, 0.0]];
+fn latency_shifts_the_response_by_exactly_its_periods() {
+    let actions = [
+        [0.8, -0.4],
+        [-0.3, 0.6],
+        [0.1, 0.1],
+        [1.0, 0.0],
+        [0.0, 0.5],
+        [0.2, 0.0],
+    ];
     let late = |latency_periods, actions: &[[f32; 2]]| {
         let disturbances = DisturbanceSettings {
             latency_periods,
@@ -149,7 +184,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
         flown(&mut simulator(Preset::Airsim, disturbances), 1, actions)
     };
     for periods in [1, 2] {
-        // The same flight as of a prompt drone that waits as long.
+        // The same episode as without latency, after waiting as long.
         let waiting = [vec![[0.0, 0.0]; periods as usize], actions.to_vec()].concat();
         assert!(late(periods, &actions) == late(0, &waiting)[..=actions.len()]);
         assert!(late(periods, &actions) != late(0, &actions));
@@ -157,7 +192,7 @@ fn latency_shifts_the_answer_by_exactly_its_periods() {
 }
 
 #[test]
-fn what_was_on_its_way_does_not_reach_the_next_flight() {
+fn a_pending_command_does_not_reach_the_next_episode() {
     let disturbances = DisturbanceSettings {
         latency_periods: 2,
         ..Default::default()
@@ -168,7 +203,8 @@ fn what_was_on_its_way_does_not_reach_the_next_flight() {
     assert!(first == flown(&mut used, 1, &[[0.0, 0.0]; 2]));
 }
 
-/// A drone `factor` times as heavy as nominal, hovering: how far it has risen after each period, metres, and how fast it rises at last, m/s.
+/// Lets a drone of `factor` times the nominal mass hover. Returns its rise after each period,
+/// metres, and its final climb rate, m/s.
 fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
     let mut simulator = simulator(
         preset,
@@ -179,7 +215,7 @@ fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
     );
     let seed = (0..)
         .find(|&seed| {
-            let drawn = Drawn::draw(
+            let drawn = DrawnDisturbances::draw(
                 &DisturbanceSettings {
                     mass_spread: 0.5,
                     ..Default::default()
@@ -191,12 +227,15 @@ fn hover(preset: Preset, factor: f32) -> (Vec<f32>, f32) {
         .unwrap();
     let seen = flown(&mut simulator, seed, &[[0.0, 0.0]; 14]);
     let start_m = seen[0].0.position_m.z;
-    let rises = seen.iter().map(|(state, _)| state.position_m.z - start_m).collect();
+    let rises = seen
+        .iter()
+        .map(|(state, _)| state.position_m.z - start_m)
+        .collect();
     (rises, seen.last().unwrap().0.velocity_mps.z)
 }
 
 #[test]
-fn heavier_drone_sinks_first_lighter_one_rises_and_both_come_to_hover() {
+fn a_heavier_drone_sinks_first_a_lighter_one_rises_and_both_reach_hover() {
     for preset in [Preset::Airsim, Preset::Hummingbird] {
         let (heavy, heavy_mps) = hover(preset, 1.2);
         let (light, light_mps) = hover(preset, 0.8);
@@ -217,20 +256,25 @@ fn masses_are_spread_evenly_over_the_range_and_do_not_depend_on_gusts() {
         ..Default::default()
     };
     let factors: Vec<f32> = (0..4000)
-        .map(|seed| Drawn::draw(&settings, &mut Pcg64Mcg::seed_from_u64(seed)).mass_factor)
+        .map(|seed| {
+            DrawnDisturbances::draw(&settings, &mut Pcg64Mcg::seed_from_u64(seed)).mass_factor
+        })
         .collect();
     assert!(factors.iter().all(|factor| (0.8..=1.2).contains(factor)));
     for quarter in 0..4 {
         let from = 0.8 + 0.1 * quarter as f32;
-        let share = factors.iter().filter(|&&f| f >= from && f < from + 0.1).count();
+        let share = factors
+            .iter()
+            .filter(|&&f| f >= from && f < from + 0.1)
+            .count();
         assert!((900..1100).contains(&share), "{share} of 4000 from {from}");
     }
-    let first = Drawn::draw(&calm, &mut Pcg64Mcg::seed_from_u64(0)).mass_factor;
+    let first = DrawnDisturbances::draw(&calm, &mut Pcg64Mcg::seed_from_u64(0)).mass_factor;
     assert_eq!(first, factors[0]);
 }
 
 #[test]
-fn gust_moves_a_hovering_drone_aside() {
+fn a_gust_moves_a_hovering_drone_aside() {
     let aside = |force_rms_n| {
         let disturbances = DisturbanceSettings {
             gust: GustSettings {
@@ -248,7 +292,7 @@ fn gust_moves_a_hovering_drone_aside() {
         (sum / 20.0).sqrt()
     };
     assert!(aside(0.0) < 1e-3);
-    // Twice the force, twice as far.
+    // Twice the force moves the drone twice as far.
     let ratio = aside(0.3) / aside(0.15);
     assert!(
         aside(0.3) > 0.1 && (1.8..2.2).contains(&ratio),
@@ -258,15 +302,15 @@ fn gust_moves_a_hovering_drone_aside() {
 }
 
 #[test]
-fn oracle_still_arrives_in_a_storm() {
+fn the_oracle_still_arrives_under_strong_disturbances() {
     let mut simulator = simulator(Preset::Airsim, stormy());
     let arrived = (0..20)
         .filter(|&seed| {
-            take_off(&mut simulator, seed);
+            reset(&mut simulator, seed);
             loop {
                 let action = Oracle::act(simulator.course(), &simulator.state());
                 if let Some(outcome) = simulator.step(action).unwrap().outcome {
-                    return outcome == Outcome::ReachedEnd;
+                    return outcome == EpisodeOutcome::ReachedEnd;
                 }
             }
         })
@@ -275,36 +319,48 @@ fn oracle_still_arrives_in_a_storm() {
 }
 
 #[test]
-fn what_is_out_of_bounds_or_would_do_nothing_is_refused_by_key() {
+fn a_setting_out_of_bounds_or_without_effect_is_refused_by_key() {
     let refusal = |text: &str, preset| {
         let settings: DisturbanceSettings = toml::from_str(text).unwrap();
-        let refused = settings.check(&of(preset), &CameraSettings::default());
+        let refused = settings.validate(&of(preset), CameraSettings::default().range_m);
         refused.map_err(|fault| fault.to_string())
     };
-    for (text, told) in [
+    for (text, expected) in [
         ("mass_spread = 0.6", "mass_spread = 0.6 is outside 0 to 0.5"),
         ("mass_spread = nan", "mass_spread = NaN"),
-        ("latency_periods = 9", "latency_periods = 9 is outside 0 to 8"),
+        (
+            "latency_periods = 9",
+            "latency_periods = 9 is outside 0 to 8",
+        ),
         ("gust.force_rms_n = -1.0", "gust.force_rms_n = -1"),
         ("gust.correlation_secs = 0.0", "gust.correlation_secs = 0"),
         ("depth.baseline_m = 1.0", "depth.baseline_m = 1"),
         ("depth.dropout_share = 0.9", "depth.dropout_share = 0.9"),
         ("depth.dropout_patch_px = 0", "depth.dropout_patch_px = 0"),
-        ("depth.sigma_constant_m = inf", "depth.sigma_constant_m = inf"),
+        (
+            "depth.sigma_constant_m = inf",
+            "depth.sigma_constant_m = inf",
+        ),
         ("depth.sigma_linear = -0.1", "makes the noise at"),
-        ("depth.sigma_quadratic_per_m = 1.0", "makes the noise at 20 m 400"),
+        (
+            "depth.sigma_quadratic_per_m = 1.0",
+            "makes the noise at 20 m 400",
+        ),
     ] {
-        let told_is = refusal(text, Preset::Airsim).unwrap_err();
-        assert!(told_is.contains(told), "{told_is}");
-        assert!(told_is.starts_with("disturbances: key "), "{told_is}");
+        let message = refusal(text, Preset::Airsim).unwrap_err();
+        assert!(message.contains(expected), "{message}");
+        assert!(message.starts_with("disturbances: key "), "{message}");
     }
     for text in ["mass_spread = 0.2", "gust.force_rms_n = 0.2"] {
         assert_eq!(refusal(text, Preset::Airsim), Ok(()));
-        let told = refusal(text, Preset::Point).unwrap_err();
-        assert!(told.contains("vehicle.preset = \"point\""), "{told}");
+        let message = refusal(text, Preset::Point).unwrap_err();
+        assert!(message.contains("vehicle.preset = \"point\""), "{message}");
     }
     assert_eq!(
-        refusal("latency_periods = 1\ndepth.model = \"stereo\"", Preset::Point),
+        refusal(
+            "latency_periods = 1\ndepth.model = \"stereo\"",
+            Preset::Point
+        ),
         Ok(())
     );
     let unknown = toml::from_str::<DisturbanceSettings>("gust.rms = 1.0").unwrap_err();

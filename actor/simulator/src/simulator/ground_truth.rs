@@ -1,44 +1,47 @@
-//! What the simulator knows of a moment and no camera sees.
+//! Ground truth: facts about a moment that the camera does not show.
 
 use crate::course::{Course, Wall};
 use crate::vehicle::VehicleState;
 
-/// A wall is behind the drone once its tail has left the opening; m from the drone's centre to its tail, with some to spare.
+/// Distance from the drone's centre to its tail plus a margin, m. A wall is behind the drone once
+/// the tail has left the opening.
 const TAIL_M: f32 = 0.6;
 
-/// What the simulator knows of a moment and no camera sees: for whoever judges a pilot in training, never for the pilot.
+/// Facts about a moment that the camera does not show: for the critic in training, never for the
+/// policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// The next two walls that the drone has not left entirely.
-    pub ahead: [Ahead; 2],
-    /// Left and up from the middle of the corridor, m.
+    /// Openings of the next two walls that the drone has not left entirely.
+    pub ahead: [OpeningAhead; 2],
+    /// Position left and up from the middle of the corridor, m.
     pub from_middle_m: [f32; 2],
-    /// To the end wall, m.
+    /// Distance to the end wall, m.
     pub to_end_m: f32,
-    /// The drone's mass, by its nominal one.
+    /// The drone's mass relative to its nominal mass.
     pub mass_factor: f32,
     /// Control periods until a command takes effect.
     pub latency_periods: f32,
-    /// The gust's force in the world: forward, left, up, N.
+    /// The gust's force in the world frame: forward, left, up, N.
     pub gust_n: [f32; 3],
 }
 
-/// An opening, seen from the drone. Behind the last wall there is the end wall, to be touched anywhere: an opening as wide as the corridor.
+/// An opening relative to the drone. Behind the last wall, the end wall stands for an opening as
+/// wide as the corridor, because the drone may touch it anywhere.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ahead {
-    /// Forward to the wall's front face, m; negative inside and behind.
+pub struct OpeningAhead {
+    /// Distance forward to the wall's front face, m; negative inside the wall and behind it.
     pub distance_m: f32,
-    /// Left and up to the opening's safe point, m.
+    /// Offset left and up to the opening's safe point, m.
     pub offset_m: [f32; 2],
-    /// Radius of the free space around that, m.
+    /// Radius of the free space around the safe point, m.
     pub clearance_m: f32,
 }
 
 impl GroundTruth {
-    /// How many numbers it is.
+    /// Length of [`Self::numbers`].
     pub const NUMBERS: usize = 16;
 
-    /// All of it in the fields' order.
+    /// Returns all fields as numbers, in their order.
     #[must_use]
     pub fn numbers(&self) -> [f32; Self::NUMBERS] {
         let [next, after] = self.ahead.map(|ahead| {
@@ -65,8 +68,8 @@ impl GroundTruth {
     }
 }
 
-impl Ahead {
-    /// The next two openings from where the drone is.
+impl OpeningAhead {
+    /// Returns the next two openings, seen from the drone.
     pub(super) fn next_two(course: &Course, state: &VehicleState) -> [Self; 2] {
         let mut walls = walls_ahead(course, state).map(|wall| Self::of_wall(wall, state));
         let mut next = || walls.next().unwrap_or_else(|| Self::of_end(course, state));
@@ -94,8 +97,11 @@ impl Ahead {
     }
 }
 
-/// The walls that the drone has not left entirely, the next one first.
-pub(crate) fn walls_ahead<'a>(course: &'a Course, state: &VehicleState) -> impl Iterator<Item = &'a Wall> {
+/// Returns the walls that the drone has not left entirely, the next one first.
+pub(crate) fn walls_ahead<'a>(
+    course: &'a Course,
+    state: &VehicleState,
+) -> impl Iterator<Item = &'a Wall> {
     let tail_m = state.position_m.x - TAIL_M;
     course
         .walls()
@@ -116,8 +122,11 @@ mod tests {
         let walls = course.walls();
         let [y_m, z_m] = walls[0].safe_point();
         let before = VehicleState::at_rest(Point3::new(walls[0].x_m() - 4.0, y_m - 1.0, z_m + 0.5));
-        let [next, after] = Ahead::next_two(&course, &before);
-        assert_eq!((next.distance_m, next.clearance_m), (4.0, walls[0].clearance_m()));
+        let [next, after] = OpeningAhead::next_two(&course, &before);
+        assert_eq!(
+            (next.distance_m, next.clearance_m),
+            (4.0, walls[0].clearance_m())
+        );
         assert!((next.offset_m[0] - 1.0).abs() < 1e-5 && (next.offset_m[1] + 0.5).abs() < 1e-5);
         let behind_first = after.distance_m - next.distance_m;
         let expected = walls.get(1).map_or(course.corridor().length_m, Wall::x_m) - walls[0].x_m();
@@ -126,10 +135,13 @@ mod tests {
         let last = walls.last().unwrap();
         let behind_all = last.x_m() + course.wall_thickness_m() + TAIL_M;
         let behind = VehicleState::at_rest(Point3::new(behind_all, 1.0, 2.0));
-        let [next, after] = Ahead::next_two(&course, &behind);
+        let [next, after] = OpeningAhead::next_two(&course, &behind);
         assert_eq!(next, after);
         assert_eq!(next.distance_m, course.corridor().length_m - behind_all);
-        assert_eq!(next.offset_m, [-1.0, course.corridor().height_m / 2.0 - 2.0]);
+        assert_eq!(
+            next.offset_m,
+            [-1.0, course.corridor().height_m / 2.0 - 2.0]
+        );
     }
 
     #[test]

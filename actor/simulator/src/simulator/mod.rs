@@ -1,10 +1,13 @@
-//! One flight at a time through a course: [`Simulator::reset`] starts it, [`Simulator::step`] lets one control period pass.
+//! Episodes through a course, one at a time: [`Simulator::reset`] starts an episode,
+//! [`Simulator::step`] flies one control period, [`Simulator::render`] draws the depth image.
 //!
-//! A flight is a pure function of course, settings, start, disturbances and actions. Numbers that are not finite never get further than the
-//! step they appear in: it returns [`SimulationError::NonFinite`] and the flight is over.
+//! An episode is a pure function of course, settings, start, disturbances and actions. A number
+//! that is not finite never survives the step in which it appears: the step returns
+//! [`SimulationError::NonFinite`] and the episode is over.
 
+mod error;
 mod ground_truth;
-mod report;
+mod reach;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -14,14 +17,17 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use rand::Rng;
 
+pub use error::{SimulationError, SimulatorError};
 pub(crate) use ground_truth::walls_ahead;
-pub use ground_truth::{Ahead, GroundTruth};
-pub use report::{LevelUp, Obstacle, Outcome, SimulationError, StepReport};
-pub use settings::{SimulatorError, SimulatorSettings};
+pub use ground_truth::{GroundTruth, OpeningAhead};
+pub use reach::OutOfReach;
+pub use settings::SimulatorSettings;
+
+pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};
 
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
-use crate::disturbances::{Delay, DisturbanceSettings, Drawn, Gust};
+use crate::disturbances::{CommandDelay, DisturbanceSettings, DrawnDisturbances, Gust};
 use crate::vehicle::{Vehicle, VehicleState};
 use crate::world::{Contact, World};
 
@@ -37,33 +43,33 @@ pub struct Simulator {
     world: World,
     camera: DepthCamera,
     disturbances: DisturbanceSettings,
-    commands: Delay,
+    commands: CommandDelay,
     gust: Option<Gust>,
-    flight: Flight,
+    episode: EpisodeState,
 }
 
-/// Where a flight stands.
+/// Progress and disturbances of the current episode.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Flight {
-    phase: Phase,
+struct EpisodeState {
+    phase: EpisodePhase,
     steps: u32,
-    /// Walls of the course whose back face the drone's centre has left behind, those before its start included.
+    /// Walls whose back face the drone's centre has left behind, including those before its start.
     walls_behind: usize,
     walls_behind_at_start: usize,
-    /// The drone's mass, by its nominal one.
+    /// The drone's mass relative to its nominal mass.
     mass_factor: f32,
-    /// Of what the camera gets wrong; `None` in a calm flight.
+    /// Seed of the camera's errors; `None` in a calm episode.
     depth_seed: Option<u64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
+enum EpisodePhase {
     Flying,
     Over,
 }
 
 impl Simulator {
-    /// A simulator of `course`, in which no flight is under way yet.
+    /// Builds a simulator of `course`, with no episode in progress yet.
     ///
     /// # Errors
     /// [`SimulatorError`] names the setting or the course at fault.
@@ -75,12 +81,16 @@ impl Simulator {
         }
         let (physics_steps, dt_secs) = settings.vehicle.physics_steps();
         let vehicle = Vehicle::trimmed(&settings.vehicle);
-        let world = World::new(&course, vehicle.body(), dt_secs).map_err(|source| SimulatorError::Mesh {
-            course: course.name().to_owned(),
-            source,
+        let world = World::new(&course, vehicle.body(), dt_secs).map_err(|source| {
+            SimulatorError::Mesh {
+                course: course.name().to_owned(),
+                source,
+            }
         })?;
         let camera = DepthCamera::new(&settings.camera, &course)?;
-        settings.disturbances.check(&settings.vehicle, &settings.camera)?;
+        settings
+            .disturbances
+            .validate(&settings.vehicle, settings.camera.range_m)?;
         Ok(Self {
             camera: camera.with_noise(&settings.disturbances.depth),
             course,
@@ -91,11 +101,11 @@ impl Simulator {
             pristine_vehicle: vehicle.clone(),
             vehicle,
             world,
-            commands: Delay::new(settings.disturbances.latency_periods),
+            commands: CommandDelay::new(settings.disturbances.latency_periods),
             disturbances: settings.disturbances.clone(),
             gust: None,
-            flight: Flight {
-                phase: Phase::Over,
+            episode: EpisodeState {
+                phase: EpisodePhase::Over,
                 steps: 0,
                 walls_behind: 0,
                 walls_behind_at_start: 0,
@@ -105,17 +115,25 @@ impl Simulator {
         })
     }
 
-    /// Starts a flight: hovering at the start of `level` (1 = before the first wall), jittered by `start` as the course says. Everything that disturbs the flight
-    /// is drawn from `disturbances`; in calm settings it has no influence.
+    /// Starts an episode with the drone hovering at the start of `level` (1 = before the first
+    /// wall).
+    ///
+    /// `start` draws the position within the course's start area. `disturbances` draws everything
+    /// that disturbs the episode; with disturbances off it has no influence.
     ///
     /// # Errors
     /// [`NoSuchLevel`] if the course has fewer walls.
-    pub fn reset(&mut self, level: u8, start: &mut impl Rng, disturbances: &mut impl Rng) -> Result<(), NoSuchLevel> {
+    pub fn reset(
+        &mut self,
+        level: u8,
+        start: &mut impl Rng,
+        disturbances: &mut impl Rng,
+    ) -> Result<(), NoSuchLevel> {
         let position_m = self.course.start_position(level, start)?;
-        let drawn = Drawn::draw(&self.disturbances, disturbances);
+        let drawn = DrawnDisturbances::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
         self.world.reset(&position_m, drawn.mass_factor);
-        let Drawn {
+        let DrawnDisturbances {
             disturbed,
             mass_factor,
             gust_seed,
@@ -129,8 +147,8 @@ impl Simulator {
             0
         });
         let walls_behind = self.walls_behind(position_m.x);
-        self.flight = Flight {
-            phase: Phase::Flying,
+        self.episode = EpisodeState {
+            phase: EpisodePhase::Flying,
             steps: 0,
             walls_behind,
             walls_behind_at_start: walls_behind,
@@ -140,30 +158,32 @@ impl Simulator {
         Ok(())
     }
 
-    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each clamped to [-1, 1]. With latency, `action` is what takes effect later.
+    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each
+    /// clamped to [-1, 1]. With latency, `action` takes effect some steps later.
     ///
-    /// The flight ends within the step at the physics step that touches something; the state is then the one at that moment.
+    /// If the body touches something, the episode ends at that physics step, within the control
+    /// period, and the state is that of the contact.
     ///
     /// # Errors
-    /// [`SimulationError::NonFinite`] names what is NaN or infinite, be it the action or the physics, and ends the flight;
-    /// [`SimulationError::NotFlying`] after a flight's end.
+    /// [`SimulationError::NonFinite`] names what is NaN or infinite, in the action or the physics;
+    /// it ends the episode. [`SimulationError::NotFlying`] if no episode is in progress.
     pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
-        if self.flight.phase == Phase::Over {
+        if self.episode.phase == EpisodePhase::Over {
             return Err(SimulationError::NotFlying);
         }
-        self.flight.steps += 1;
-        let walls_behind_before = self.flight.walls_behind;
+        self.episode.steps += 1;
+        let walls_behind_before = self.episode.walls_behind;
 
         let velocity_mps = self.commanded_velocity(action)?;
         let contact = self.fly_until_contact(&velocity_mps)?;
         let outcome = self.outcome(contact);
 
         if outcome.is_some() {
-            self.flight.phase = Phase::Over;
+            self.episode.phase = EpisodePhase::Over;
         }
         Ok(StepReport {
             walls_passed: self.walls_passed(),
-            level_up: if self.flight.walls_behind > walls_behind_before {
+            level_up: if self.episode.walls_behind > walls_behind_before {
                 LevelUp::Yes
             } else {
                 LevelUp::No
@@ -173,54 +193,58 @@ impl Simulator {
         })
     }
 
-    /// Draws what the depth camera sees now into `image`, row by row from the top. Its errors belong to the step: looking twice shows the same ones.
+    /// Draws the current depth image into `image`, row by row from the top. The camera's errors
+    /// belong to the step: rendering twice gives the same image.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
         let pose = self.world.state().pose();
-        match self.flight.depth_seed {
+        match self.episode.depth_seed {
             Some(seed) => {
-                let key = seed ^ u64::from(self.flight.steps);
+                let key = seed ^ u64::from(self.episode.steps);
                 self.camera.render_with_noise(&pose, key, image);
             }
             None => self.camera.render(&pose, image),
         }
     }
 
-    /// Where the drone is and how it moves.
+    /// Returns the drone's pose and motion.
     #[must_use]
     pub fn state(&self) -> VehicleState {
         self.world.state()
     }
 
-    /// What no camera sees of this moment.
+    /// Returns the ground truth of the current moment, which the camera does not show.
     #[must_use]
     pub fn ground_truth(&self) -> GroundTruth {
         let state = self.state();
         let corridor = self.course.corridor();
         let [x_m, y_m, z_m] = state.position_m.coords.into();
         GroundTruth {
-            ahead: Ahead::next_two(&self.course, &state),
+            ahead: OpeningAhead::next_two(&self.course, &state),
             from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
             to_end_m: corridor.length_m - x_m,
-            mass_factor: self.flight.mass_factor,
+            mass_factor: self.episode.mass_factor,
             latency_periods: self.commands.periods() as f32,
-            gust_n: self.gust.as_ref().map_or([0.0; 3], |gust| gust.force_n().into()),
+            gust_n: self
+                .gust
+                .as_ref()
+                .map_or([0.0; 3], |gust| gust.force_n().into()),
         }
     }
 
-    /// The level the drone is in: 1 before the first wall, one more behind each.
+    /// Returns the drone's level: 1 before the first wall, one more behind each wall.
     #[must_use]
     pub fn level(&self) -> u8 {
         // A course has at most `MAX_WALLS` walls.
-        self.flight.walls_behind as u8 + 1
+        self.episode.walls_behind as u8 + 1
     }
 
-    /// Walls passed in this flight so far.
+    /// Returns the number of walls passed in this episode so far.
     #[must_use]
     pub fn walls_passed(&self) -> u8 {
-        (self.flight.walls_behind - self.flight.walls_behind_at_start) as u8
+        (self.episode.walls_behind - self.episode.walls_behind_at_start) as u8
     }
 
-    /// The course flown.
+    /// Returns the course.
     #[must_use]
     pub fn course(&self) -> &Course {
         &self.course
@@ -228,24 +252,29 @@ impl Simulator {
 
     fn commanded_velocity(&mut self, action: [f32; 2]) -> Result<Vector3<f32>, SimulationError> {
         if !action.iter().all(|v| v.is_finite()) {
-            return Err(self.break_off("action"));
+            return Err(self.abort("action"));
         }
         let [left, up] = self.commands.pass(action.map(|v| v.clamp(-1.0, 1.0)));
         Ok(Vector3::new(self.forward_speed_mps, left, up))
     }
 
-    fn fly_until_contact(&mut self, velocity_mps: &Vector3<f32>) -> Result<Contact, SimulationError> {
+    fn fly_until_contact(
+        &mut self,
+        velocity_mps: &Vector3<f32>,
+    ) -> Result<Contact, SimulationError> {
         for _ in 0..self.physics_steps {
-            let actuation = self.vehicle.actuate(&self.world.state(), velocity_mps, self.dt_secs);
+            let actuation = self
+                .vehicle
+                .actuate(&self.world.state(), velocity_mps, self.dt_secs);
             let gust_n = self.gust.as_mut().map(Gust::advance);
             self.world.advance(&actuation, gust_n);
 
             if self.world.is_quarantined() {
-                return Err(self.break_off("the body's pose or velocity"));
+                return Err(self.abort("the body's pose or velocity"));
             }
-            // A wall passed stays passed, should the drone be blown back.
-            self.flight.walls_behind = self
-                .flight
+            // A passed wall stays passed, even if a gust blows the drone back.
+            self.episode.walls_behind = self
+                .episode
                 .walls_behind
                 .max(self.walls_behind(self.world.position_x_m()));
             match self.world.contact() {
@@ -256,25 +285,27 @@ impl Simulator {
         Ok(Contact::Nothing)
     }
 
-    fn outcome(&self, contact: Contact) -> Option<Outcome> {
+    fn outcome(&self, contact: Contact) -> Option<EpisodeOutcome> {
         match contact {
-            Contact::Obstacle => Some(Outcome::Collided),
-            Contact::EndWall => Some(Outcome::ReachedEnd),
-            Contact::Nothing if self.flight.steps >= self.max_steps => Some(Outcome::TimedOut),
+            Contact::Obstacle => Some(EpisodeOutcome::Collided),
+            Contact::EndWall => Some(EpisodeOutcome::ReachedEnd),
+            Contact::Nothing if self.episode.steps >= self.max_steps => {
+                Some(EpisodeOutcome::TimedOut)
+            }
             Contact::Nothing => None,
         }
     }
 
-    /// What the body has hit, once it is known to touch an obstacle.
+    /// Returns the obstacle that the body touches. It must touch one.
     fn obstacle(&self) -> Obstacle {
-        match self.world.touched_wall(&self.course) {
+        match self.world.touched_wall() {
             // A course has at most `MAX_WALLS` walls.
             Some(place) => Obstacle::Wall(place as u8 + 1),
             None => Obstacle::Corridor,
         }
     }
 
-    /// Number of walls whose back face lies before `x_m`.
+    /// Returns the number of walls whose back face lies before `x_m`.
     fn walls_behind(&self, x_m: f32) -> usize {
         let thickness_m = self.course.wall_thickness_m();
         self.course
@@ -284,11 +315,11 @@ impl Simulator {
             .count()
     }
 
-    fn break_off(&mut self, what: &'static str) -> SimulationError {
-        self.flight.phase = Phase::Over;
+    fn abort(&mut self, what: &'static str) -> SimulationError {
+        self.episode.phase = EpisodePhase::Over;
         SimulationError::NonFinite {
             what,
-            step: self.flight.steps,
+            step: self.episode.steps,
         }
     }
 }

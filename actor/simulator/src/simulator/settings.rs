@@ -1,30 +1,33 @@
-//! The simulator's section of the configuration, and why a simulator cannot be built from it.
+//! The `[simulator]` section of the configuration.
 
-use rapier3d::parry::shape::TriMeshBuilderError;
 use serde::{Deserialize, Serialize};
 
-use crate::camera::{CameraFault, CameraSettings};
+use crate::camera::CameraSettings;
 use crate::course::GeneratorRanges;
-use crate::disturbances::{DisturbanceFault, DisturbanceSettings};
-use crate::reward::{RewardSettings, RewardSettingsError};
-use crate::vehicle::{VehicleSettings, VehicleSettingsError};
+use crate::disturbances::DisturbanceSettings;
+use crate::reward::RewardSettings;
+use crate::vehicle::VehicleSettings;
 
-/// Everything about a simulator but its course: the `[simulator]` section of the configuration.
+/// All settings of a simulator except its course: section `[simulator]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimulatorSettings {
     /// The drone and its control.
     pub vehicle: VehicleSettings,
-    /// Its depth camera.
+    /// The drone's depth camera.
     pub camera: CameraSettings,
-    /// Size of the reward terms. The simulator itself gives no reward: see [`crate::reward::RewardTerms`].
+    /// Size of each reward term. The simulator only checks them; the caller computes the reward
+    /// with [`RewardTerms::of`](crate::reward::RewardTerms::of).
     pub reward: RewardSettings,
-    /// Ranges that random courses are drawn from, for whoever trains on them: see [`Course::generate`](crate::course::Course::generate).
+    /// Ranges from which [`Course::generate`](crate::course::Course::generate) draws random
+    /// courses. The simulator itself does not use them.
     pub generator: GeneratorRanges,
-    /// What disturbs flights: noise in the image, gusts, latency, another mass. All off by default.
+    /// Disturbances of episodes: depth noise, gusts, latency, a different mass. All are off by
+    /// default.
     pub disturbances: DisturbanceSettings,
-    /// Steps after which a flight is broken off as [`Outcome::TimedOut`](super::Outcome::TimedOut). Default 160: the corridor takes 120 steps of 0.5 s at
-    /// 1 m/s, and a third is added.
+    /// Steps after which an episode ends as
+    /// [`EpisodeOutcome::TimedOut`](super::EpisodeOutcome::TimedOut). Default 160: the corridor
+    /// takes 120 steps of 0.5 s at 1 m/s, plus a third.
     pub max_steps: u32,
 }
 
@@ -39,32 +42,4 @@ impl Default for SimulatorSettings {
             max_steps: 160,
         }
     }
-}
-
-/// Why a simulator cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum SimulatorError {
-    /// A vehicle setting is out of bounds.
-    #[error(transparent)]
-    Vehicle(#[from] VehicleSettingsError),
-    /// A camera setting is out of bounds.
-    #[error(transparent)]
-    Camera(#[from] CameraFault),
-    /// A reward is out of bounds.
-    #[error(transparent)]
-    Reward(#[from] RewardSettingsError),
-    /// A disturbance is out of bounds.
-    #[error(transparent)]
-    Disturbances(#[from] DisturbanceFault),
-    /// No flight could ever begin.
-    #[error("[simulator] max_steps = 0: every flight would be over before its first step; give it at least 1")]
-    NoSteps,
-    /// The course's surfaces are not a mesh.
-    #[error("course \"{course}\": its surfaces make no collision mesh")]
-    Mesh {
-        /// The course's name.
-        course: String,
-        /// parry's reason.
-        source: TriMeshBuilderError,
-    },
 }

@@ -1,4 +1,4 @@
-//! Flights from start to end: determinism, counting, outcomes, refusals.
+//! Episodes from start to end: determinism, counting, outcomes, refusals.
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
@@ -26,17 +26,19 @@ fn rng(seed: u64) -> Pcg64Mcg {
     Pcg64Mcg::seed_from_u64(seed)
 }
 
-/// Flies under `pilot` to the end and returns each step's state and report.
+/// Flies `choose_action` to the end and returns each step's state and report.
 fn fly(
     simulator: &mut Simulator,
     level: u8,
     seed: u64,
-    pilot: impl Fn(&Course, &VehicleState) -> [f32; 2],
+    choose_action: impl Fn(&Course, &VehicleState) -> [f32; 2],
 ) -> Vec<(VehicleState, StepReport)> {
-    simulator.reset(level, &mut rng(seed), &mut rng(!seed)).unwrap();
+    simulator
+        .reset(level, &mut rng(seed), &mut rng(!seed))
+        .unwrap();
     let mut steps = Vec::new();
     loop {
-        let action = pilot(simulator.course(), &simulator.state());
+        let action = choose_action(simulator.course(), &simulator.state());
         let report = simulator.step(action).unwrap();
         steps.push((simulator.state(), report));
         if report.outcome.is_some() {
@@ -62,10 +64,10 @@ fn bits(steps: &[(VehicleState, StepReport)]) -> Vec<u32> {
 }
 
 #[test]
-fn flight_after_another_flight_is_bit_equal_to_one_in_a_fresh_simulator() {
+fn episode_after_another_episode_is_bit_equal_to_one_in_a_fresh_simulator() {
     for preset in PRESETS {
         let mut used = simulator(preset);
-        // One flight that collides in a wild attitude, one that arrives.
+        // One episode collides in a wild attitude, the other reaches the end.
         fly(&mut used, 3, 7, |_, _| [1.0, -1.0]);
         fly(&mut used, 1, 8, Oracle::act);
         let again = fly(&mut used, 2, 9, Oracle::act);
@@ -82,11 +84,14 @@ fn whole_course_passes_every_wall_once_and_reaches_the_end() {
         let (state, last) = steps.last().unwrap();
         assert_eq!(
             last.outcome,
-            Some(Outcome::ReachedEnd),
+            Some(EpisodeOutcome::ReachedEnd),
             "{preset:?} at {}",
             state.position_m
         );
-        assert_eq!((last.walls_passed, simulator.level(), last.hit), (5, 6, None));
+        assert_eq!(
+            (last.walls_passed, simulator.level(), last.hit),
+            (5, 6, None)
+        );
         assert_eq!(
             steps
                 .iter()
@@ -122,11 +127,14 @@ fn wall_counts_when_the_centre_leaves_its_back_face() {
 }
 
 #[test]
-fn straight_flight_ends_at_the_first_wall_with_the_nose_on_it() {
-    // The test course's first opening is off the middle.
+fn straight_episode_ends_at_the_first_wall_with_the_nose_on_it() {
+    // The test course's first opening does not cover the middle.
     let steps = fly(&mut simulator(Preset::Point), 1, 1, |_, _| [0.0, 0.0]);
     let (state, last) = steps.last().unwrap();
-    assert_eq!((last.outcome, last.walls_passed), (Some(Outcome::Collided), 0));
+    assert_eq!(
+        (last.outcome, last.walls_passed),
+        (Some(EpisodeOutcome::Collided), 0)
+    );
     assert_eq!(last.hit, Some(Obstacle::Wall(1)));
     let nose_m = state.position_m.x + 0.49;
     assert!((10.0..10.01).contains(&nose_m), "{nose_m}");
@@ -139,7 +147,7 @@ fn floor_ceiling_and_sides_are_solid() {
         let (state, last) = steps.last().unwrap();
         assert_eq!(
             (last.outcome, last.hit),
-            (Some(Outcome::Collided), Some(Obstacle::Corridor))
+            (Some(EpisodeOutcome::Collided), Some(Obstacle::Corridor))
         );
         assert!(
             state.position_m.x < 9.0,
@@ -150,7 +158,7 @@ fn floor_ceiling_and_sides_are_solid() {
 }
 
 #[test]
-fn step_limit_breaks_the_flight_off_as_timed_out() {
+fn step_limit_ends_the_episode_as_timed_out() {
     let settings = SimulatorSettings {
         max_steps: 3,
         ..Default::default()
@@ -158,7 +166,10 @@ fn step_limit_breaks_the_flight_off_as_timed_out() {
     let mut simulator = Simulator::new(Arc::new(test_course()), &settings).unwrap();
     let steps = fly(&mut simulator, 1, 1, |_, _| [0.0, 0.0]);
     assert_eq!(steps.len(), 3);
-    assert_eq!((steps[2].1.outcome, steps[2].1.hit), (Some(Outcome::TimedOut), None));
+    assert_eq!(
+        (steps[2].1.outcome, steps[2].1.hit),
+        (Some(EpisodeOutcome::TimedOut), None)
+    );
     assert_eq!(simulator.step([0.0, 0.0]), Err(SimulationError::NotFlying));
 }
 
@@ -171,7 +182,7 @@ fn actions_beyond_the_range_are_clamped() {
 }
 
 #[test]
-fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
+fn action_that_is_not_a_number_ends_the_episode_with_an_error() {
     let mut simulator = simulator(Preset::Airsim);
     simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
     simulator.step([0.0, 0.0]).unwrap();
@@ -187,7 +198,7 @@ fn action_that_is_not_a_number_ends_the_flight_with_an_error() {
 }
 
 #[test]
-fn physics_that_is_not_a_number_ends_the_flight_with_an_error() {
+fn physics_that_is_not_a_number_ends_the_episode_with_an_error() {
     for preset in PRESETS {
         let mut simulator = simulator(preset);
         simulator.reset(1, &mut rng(1), &mut rng(2)).unwrap();
@@ -197,8 +208,12 @@ fn physics_that_is_not_a_number_ends_the_flight_with_an_error() {
         }
         let error = simulator.step([0.0, 0.0]);
         let what = "the body's pose or velocity";
-        assert_eq!(error, Err(SimulationError::NonFinite { what, step: 1 }), "{preset:?}");
-        // A new flight starts clean.
+        assert_eq!(
+            error,
+            Err(SimulationError::NonFinite { what, step: 1 }),
+            "{preset:?}"
+        );
+        // A new episode starts clean.
         assert!(!fly(&mut simulator, 1, 1, Oracle::act).is_empty());
     }
 }
@@ -241,14 +256,16 @@ fn settings_out_of_bounds_are_refused_by_key() {
 
 #[test]
 fn level_beyond_the_course_is_refused() {
-    let error = simulator(Preset::Point).reset(6, &mut rng(1), &mut rng(2)).unwrap_err();
+    let error = simulator(Preset::Point)
+        .reset(6, &mut rng(1), &mut rng(2))
+        .unwrap_err();
     assert_eq!((error.level, error.levels), (6, 5));
 }
 
 #[test]
-fn the_ground_truth_tells_what_disturbs_a_flight_and_nothing_of_the_kind_in_a_calm_one() {
+fn the_ground_truth_holds_the_disturbances_of_an_episode_and_none_in_a_calm_one() {
     let mut settings = SimulatorSettings::default();
-    let mut told = |share: f32| {
+    let mut ground_truth = |share: f32| {
         settings.disturbances.share = share;
         settings.disturbances.mass_spread = 0.2;
         settings.disturbances.latency_periods = 2;
@@ -258,14 +275,18 @@ fn the_ground_truth_tells_what_disturbs_a_flight_and_nothing_of_the_kind_in_a_ca
         simulator.step([0.0, 0.0]).unwrap();
         simulator.ground_truth()
     };
-    let (calm, disturbed) = (told(0.0), told(1.0));
+    let (calm, disturbed) = (ground_truth(0.0), ground_truth(1.0));
     assert_eq!(
         (calm.mass_factor, calm.latency_periods, calm.gust_n),
         (1.0, 0.0, [0.0; 3])
     );
     assert_eq!(disturbed.latency_periods, 2.0);
     let deviation = (disturbed.mass_factor - 1.0).abs();
-    assert!(deviation > 0.001 && deviation <= 0.2, "{}", disturbed.mass_factor);
+    assert!(
+        deviation > 0.001 && deviation <= 0.2,
+        "{}",
+        disturbed.mass_factor
+    );
     assert!(
         disturbed.gust_n.iter().all(|force_n| *force_n != 0.0),
         "{:?}",

@@ -1,19 +1,19 @@
-//! Suites as TOML files. A file that is refused is refused by file, entry and key.
+//! Suite files, in TOML. An error names the file, the entry and the key.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::{EntryCourses, MOST_FLIGHTS, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
+use super::{EntryCourses, MOST_EPISODES, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
-use crate::text::read_text;
+use crate::text::{message_of, parse_whole, read_text};
 
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;
 
-/// Why a suite cannot be flown.
+/// Reason why a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
 pub enum SuiteError {
     /// The file cannot be read.
@@ -21,15 +21,15 @@ pub enum SuiteError {
     Read {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Not TOML, an unknown key, or a value of the wrong kind.
+    /// The file is not TOML, or has an unknown key or a value of the wrong kind.
     #[error("{}: {message}", path.display())]
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where, and what is wrong, on one line.
+        /// The line and the problem.
         message: String,
     },
     /// Too few or too many entries.
@@ -37,7 +37,7 @@ pub enum SuiteError {
     Count {
         /// The file.
         path: PathBuf,
-        /// How many it has.
+        /// Entries found.
         count: usize,
     },
     /// An entry cannot be flown.
@@ -47,38 +47,44 @@ pub enum SuiteError {
         path: PathBuf,
         /// The entry's name.
         entry: String,
-        /// What is wrong with it.
-        source: Box<EntryFault>,
+        /// The entry's fault.
+        source: Box<SuiteEntryError>,
     },
 }
 
-/// Why an entry of a suite cannot be flown.
+/// Reason why an entry of a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
-pub enum EntryFault {
-    /// It would be taken for another.
-    #[error("another entry has this name: reports could not tell them apart")]
+pub enum SuiteEntryError {
+    /// Another entry has the same name.
+    #[error("another entry has this name: give each entry its own name")]
     RepeatedName,
-    /// No courses, or of several kinds.
-    #[error("names its courses by {0} of the keys course, orders_of and generated: give it exactly one")]
+    /// The entry has no courses, or courses of several kinds.
+    #[error(
+        "names its courses by {0} of the keys course, orders_of and generated: give it exactly one"
+    )]
     Courses(usize),
-    /// A seed without anything to generate.
-    #[error("has first_seed, but nothing generated: leave it out, or add generated")]
-    SeedOfNothing,
-    /// No flights, or too many.
-    #[error("flights = {0} is outside 1 to {MOST_FLIGHTS}")]
-    Flights(u64),
-    /// No number of flights.
-    #[error("has no flights, and the suite has none for all its entries: add flights to either")]
-    NoFlights,
+    /// `first_seed` without generated courses.
+    #[error("has first_seed but no generated courses: remove first_seed or add generated")]
+    SeedWithoutGenerated,
+    /// Too few or too many episodes.
+    #[error("episodes = {0} is outside 1 to {MOST_EPISODES}")]
+    Episodes(u64),
+    /// Neither the entry nor the suite has a number of episodes.
+    #[error("has no episodes, and neither has the suite: add episodes to one of them")]
+    NoEpisodes,
     /// A course file cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
     /// Too many orders.
-    #[error("orders_of: {} has {walls} walls, more than {MOST_WALLS_TO_ORDER}: they have too many orders", path.display())]
+    #[error(
+        "orders_of: {} has {walls} walls, more than {MOST_WALLS_TO_ORDER}: there are too many \
+         orders",
+        path.display()
+    )]
     TooManyOrders {
         /// The course file.
         path: PathBuf,
-        /// How many walls it has.
+        /// Number of its walls.
         walls: usize,
     },
     /// An order cannot be flown.
@@ -86,33 +92,33 @@ pub enum EntryFault {
     Order {
         /// The course file.
         path: PathBuf,
-        /// Labels in the order.
+        /// The walls' labels in this order.
         order: Vec<u32>,
-        /// Why.
+        /// The course's fault.
         source: CourseFault,
     },
-    /// Nothing can be generated.
+    /// No course can be generated.
     #[error(transparent)]
     Ranges(#[from] RangesError),
 }
 
-/// A suite file as it is written.
+/// Contents of a suite file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct SuiteFile {
     name: String,
-    /// Of every entry that says nothing else.
-    flights: Option<u64>,
+    /// Episodes of every entry that does not set its own number.
+    episodes: Option<u64>,
     #[serde(default)]
-    entry: Vec<EntryFile>,
+    entry: Vec<EntryTable>,
 }
 
-/// An entry as it is written. Paths are relative to the suite file.
+/// Contents of an `[[entry]]` table. Paths are relative to the suite file.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct EntryFile {
+struct EntryTable {
     name: String,
-    flights: Option<u64>,
+    episodes: Option<u64>,
     course: Option<PathBuf>,
     orders_of: Option<PathBuf>,
     generated: Option<GeneratorRanges>,
@@ -135,15 +141,16 @@ impl Suite {
         Self::parse(&text, path)
     }
 
-    /// Reads a suite from the text of a suite file. `path` is named in errors, and course files are looked for from its folder.
+    /// Reads a suite from the text of a suite file. `path` serves errors, and its folder is the
+    /// base of relative course paths.
     ///
     /// # Errors
-    /// As [`Suite::load`].
+    /// Like [`Suite::load`].
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, SuiteError> {
         let path = path.as_ref();
-        let file: SuiteFile = toml::from_str(text).map_err(|error| SuiteError::Syntax {
+        let file: SuiteFile = parse_whole(text).map_err(|error| SuiteError::Syntax {
             path: path.to_owned(),
-            message: located(text, &error),
+            message: syntax_message(text, &error),
         })?;
         if !(1..=MOST_ENTRIES).contains(&file.entry.len()) {
             return Err(SuiteError::Count {
@@ -156,64 +163,78 @@ impl Suite {
             name: file.name,
             entries: Vec::new(),
         };
-        for written in file.entry {
-            let entry = written.name.clone();
-            let read = suite.entry(written, file.flights, folder);
-            suite.entries.push(read.map_err(|source| SuiteError::Entry {
-                path: path.to_owned(),
-                entry,
-                source: Box::new(source),
-            })?);
+        for table in file.entry {
+            let entry = table.name.clone();
+            let checked = suite.entry(table, file.episodes, folder);
+            suite
+                .entries
+                .push(checked.map_err(|source| SuiteError::Entry {
+                    path: path.to_owned(),
+                    entry,
+                    source: Box::new(source),
+                })?);
         }
         Ok(suite)
     }
 
-    /// The next entry, if it can be flown beside those already there.
-    fn entry(&self, written: EntryFile, flights: Option<u64>, folder: &Path) -> Result<SuiteEntry, EntryFault> {
-        if self.entries.iter().any(|entry| entry.name == written.name) {
-            return Err(EntryFault::RepeatedName);
+    /// Returns the next entry if it can be flown and its name is new.
+    fn entry(
+        &self,
+        table: EntryTable,
+        episodes: Option<u64>,
+        folder: &Path,
+    ) -> Result<SuiteEntry, SuiteEntryError> {
+        if self.entries.iter().any(|entry| entry.name == table.name) {
+            return Err(SuiteEntryError::RepeatedName);
         }
-        let flights = written.flights.or(flights).ok_or(EntryFault::NoFlights)?;
-        if !(1..=MOST_FLIGHTS).contains(&flights) {
-            return Err(EntryFault::Flights(flights));
+        let episodes = table
+            .episodes
+            .or(episodes)
+            .ok_or(SuiteEntryError::NoEpisodes)?;
+        if !(1..=MOST_EPISODES).contains(&episodes) {
+            return Err(SuiteEntryError::Episodes(episodes));
         }
         Ok(SuiteEntry {
-            flights,
-            courses: courses(&written, folder)?,
-            disturbances: written.disturbances,
-            name: written.name,
+            episodes,
+            courses: courses(&table, folder)?,
+            disturbances: table.disturbances,
+            name: table.name,
         })
     }
 }
 
-fn courses(written: &EntryFile, folder: &Path) -> Result<EntryCourses, EntryFault> {
-    if written.first_seed.is_some() && written.generated.is_none() {
-        return Err(EntryFault::SeedOfNothing);
+fn courses(table: &EntryTable, folder: &Path) -> Result<EntryCourses, SuiteEntryError> {
+    if table.first_seed.is_some() && table.generated.is_none() {
+        return Err(SuiteEntryError::SeedWithoutGenerated);
     }
-    match (&written.course, &written.orders_of, &written.generated) {
-        (Some(file), None, None) => Ok(EntryCourses::Listed(vec![Arc::new(Course::load(folder.join(file))?)])),
+    match (&table.course, &table.orders_of, &table.generated) {
+        (Some(file), None, None) => Ok(EntryCourses::Listed(vec![Arc::new(Course::load(
+            folder.join(file),
+        )?)])),
         (None, Some(file), None) => all_orders(&folder.join(file)).map(EntryCourses::Listed),
         (None, None, Some(ranges)) => {
-            let first_seed = written.first_seed.unwrap_or(0);
-            // What is wrong with the ranges shows with the first course.
+            let first_seed = table.first_seed.unwrap_or(0);
+            // The first course shows any fault of the ranges.
             Course::generate(first_seed, ranges)?;
             Ok(EntryCourses::Generated {
                 first_seed,
                 ranges: ranges.clone(),
             })
         }
-        (course, orders_of, generated) => Err(EntryFault::Courses(
-            usize::from(course.is_some()) + usize::from(orders_of.is_some()) + usize::from(generated.is_some()),
+        (course, orders_of, generated) => Err(SuiteEntryError::Courses(
+            usize::from(course.is_some())
+                + usize::from(orders_of.is_some())
+                + usize::from(generated.is_some()),
         )),
     }
 }
 
-/// The course of the file in every order of its walls, its own first.
-fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, EntryFault> {
+/// Returns the course of the file in every order of its walls, its own order first.
+fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, SuiteEntryError> {
     let course = Course::load(path)?;
     let walls = course.walls();
     if walls.len() > MOST_WALLS_TO_ORDER {
-        return Err(EntryFault::TooManyOrders {
+        return Err(SuiteEntryError::TooManyOrders {
             path: path.to_owned(),
             walls: walls.len(),
         });
@@ -222,7 +243,7 @@ fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, EntryFault> {
         course
             .reordered(&order)
             .map(Arc::new)
-            .map_err(|source| EntryFault::Order {
+            .map_err(|source| SuiteEntryError::Order {
                 path: path.to_owned(),
                 order: order.iter().map(|&place| walls[place].label().0).collect(),
                 source,
@@ -231,9 +252,13 @@ fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, EntryFault> {
     orders(walls.len()).into_iter().map(reordered).collect()
 }
 
-/// The parser's refusal on one line; its own draws a picture over several.
-fn located(text: &str, error: &toml::de::Error) -> String {
-    let before = text.get(..error.span().unwrap_or_default().start).unwrap_or("");
+/// Returns the parser's error on one line; its own text takes several.
+fn syntax_message(text: &str, error: &toml::de::Error) -> String {
+    let message = message_of(error);
+    let Some(place) = error.span() else {
+        return message;
+    };
+    let before = text.get(..place.start).unwrap_or("");
     let line = before.matches('\n').count() + 1;
-    format!("line {line}: {}", error.message().trim_end().replace('\n', " "))
+    format!("line {line}: {message}")
 }

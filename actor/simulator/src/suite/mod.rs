@@ -1,7 +1,8 @@
-//! Evaluation suites: what a pilot is put to, entry by entry.
+//! Evaluation suites: lists of entries that a policy flies.
 //!
-//! An entry names courses (a file, all orders of a file's walls, or generated ones), how many flights are spread over them, and what disturbs them. A suite says all of it
-//! by itself, so that two pilots that were trained on different courses, and with different disturbances, are put to the same.
+//! An entry names its courses (a file, all orders of a file's walls, or generated ones), the number
+//! of episodes on them, and their disturbances. A suite is self-contained, so that it compares
+//! policies that were trained on different courses and with different disturbances.
 
 mod file;
 #[cfg(test)]
@@ -9,82 +10,100 @@ mod tests;
 
 use std::sync::Arc;
 
-pub use file::{EntryFault, SuiteError};
+pub use file::{SuiteEntryError, SuiteError};
 
 use crate::course::{Course, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
+use crate::simulator::{OutOfReach, SimulatorSettings};
 
-/// Most flights of an entry.
-pub const MOST_FLIGHTS: u64 = 1_000_000;
-/// Most walls of a course of which all orders are flown: 720 courses.
+/// Most episodes of an entry.
+pub const MOST_EPISODES: u64 = 1_000_000;
+/// Most walls of a course for `orders_of`: 6 walls have 720 orders.
 pub const MOST_WALLS_TO_ORDER: usize = 6;
 
-/// A list of entries, none of which is called as another.
+/// An evaluation suite: entries with distinct names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Suite {
-    /// What reports call it.
+    /// Name for reports.
     pub name: String,
-    /// What is flown, in order.
+    /// Entries in the order in which they are flown.
     pub entries: Vec<SuiteEntry>,
 }
 
-/// Flights of one kind.
+/// Entry of a suite: episodes of one kind.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SuiteEntry {
-    /// What reports call it.
+    /// Name for reports.
     pub name: String,
-    /// How many.
-    pub flights: u64,
-    /// Where.
+    /// Number of episodes.
+    pub episodes: u64,
+    /// Courses of the episodes.
     pub courses: EntryCourses,
-    /// What disturbs them.
+    /// Disturbances of the episodes.
     pub disturbances: DisturbanceSettings,
 }
 
-/// The courses of an entry. Flight n flies course n, and begins anew after the last.
+/// Courses of an entry. Episode n flies course n; after the last course, the first follows again.
 #[derive(Debug, Clone, PartialEq)]
 pub enum EntryCourses {
-    /// These; at least one.
+    /// A list of at least one course.
     Listed(Vec<Arc<Course>>),
-    /// One for each flight: that of the seed `first_seed` + n.
+    /// One course per episode, generated from the seed `first_seed` + n.
     Generated {
-        /// Seed of the first flight's course.
+        /// Seed of the first episode's course.
         first_seed: u64,
-        /// What they are drawn from.
+        /// Ranges from which the courses are drawn.
         ranges: GeneratorRanges,
     },
 }
 
 impl EntryCourses {
-    /// Number of the course that flight `flight`, from 0, flies: two flights with one number fly one course.
+    /// Returns the number of the course that episode `episode`, from 0, flies. Episodes with the
+    /// same number fly the same course.
     #[must_use]
-    pub fn number_of(&self, flight: u64) -> u64 {
+    pub fn number_of(&self, episode: u64) -> u64 {
         match self {
-            Self::Listed(courses) => flight % courses.len() as u64,
-            Self::Generated { .. } => flight,
+            Self::Listed(courses) => episode % courses.len() as u64,
+            Self::Generated { .. } => episode,
         }
     }
 
-    /// The course of flight `flight`, from 0.
+    /// Checks that an episode with `settings` can reach the end of each course.
     ///
     /// # Errors
-    /// [`RangesError`] if none can be generated for it.
-    pub fn of_flight(&self, flight: u64) -> Result<Arc<Course>, RangesError> {
+    /// [`OutOfReach`] of the first course whose end lies too far.
+    pub fn check_reach(&self, settings: &SimulatorSettings) -> Result<(), OutOfReach> {
         match self {
-            Self::Listed(courses) => Ok(Arc::clone(&courses[self.number_of(flight) as usize])),
+            Self::Listed(courses) => courses
+                .iter()
+                .try_for_each(|course| settings.check_reach(course.corridor(), course.start())),
+            Self::Generated { ranges, .. } => settings.check_reach(ranges.corridor, ranges.start),
+        }
+    }
+
+    /// Returns the course of episode `episode`, from 0.
+    ///
+    /// # Errors
+    /// [`RangesError`] if no course can be generated for it.
+    pub fn of_episode(&self, episode: u64) -> Result<Arc<Course>, RangesError> {
+        match self {
+            Self::Listed(courses) => Ok(Arc::clone(&courses[self.number_of(episode) as usize])),
             Self::Generated { first_seed, ranges } => {
-                Course::generate(first_seed.wrapping_add(flight), ranges).map(Arc::new)
+                Course::generate(first_seed.wrapping_add(episode), ranges).map(Arc::new)
             }
         }
     }
 }
 
-/// All orders of `count` things, the first of which leaves everything where it is. However few are taken from the beginning, they are spread over all: in lexicographic
-/// order, the first 24 of 120 would all begin alike.
+/// Returns all orders of `count` items, the identity first.
+///
+/// They are shuffled so that the first few already cover all kinds: in lexicographic order, the
+/// first 24 of 120 would all start with the same item.
 fn orders(count: usize) -> Vec<Vec<usize>> {
     let lexicographic = all_orders(count);
     let length = lexicographic.len();
-    // Steps of about the golden section of the way, which meet every order once when their length and the number of orders have no common factor.
+    // Steps of about the golden section of the list. They meet every order once if their length and
+    // the number of orders have no common factor.
     let step = (length * 618 / 1000..)
         .find(|&step| common_factor(step, length) == 1)
         .unwrap_or(1);
@@ -97,15 +116,18 @@ fn common_factor(a: usize, b: usize) -> usize {
     if b == 0 { a } else { common_factor(b, a % b) }
 }
 
-/// All orders of `count` things in lexicographic order.
+/// Returns all orders of `count` items in lexicographic order.
 fn all_orders(count: usize) -> Vec<Vec<usize>> {
     let mut all = vec![Vec::new()];
     for _ in 0..count {
         all = all
             .into_iter()
-            .flat_map(|begun: Vec<usize>| {
-                let free = (0..count).filter(|next| !begun.contains(next)).collect::<Vec<_>>();
-                free.into_iter().map(move |next| [begun.as_slice(), &[next]].concat())
+            .flat_map(|prefix: Vec<usize>| {
+                let free = (0..count)
+                    .filter(|next| !prefix.contains(next))
+                    .collect::<Vec<_>>();
+                free.into_iter()
+                    .map(move |next| [prefix.as_slice(), &[next]].concat())
             })
             .collect();
     }

@@ -1,7 +1,8 @@
 //! Cascade flight controller: velocity → tilt → body rates → rotor commands, and climb → throttle.
 //!
-//! The structure is SimpleFlight's. One departure: velocity errors are taken in the heading frame (yawed, but level), where
-//! SimpleFlight takes them in the tilted body frame; at the few degrees flown here the two agree to second order.
+//! The structure is SimpleFlight's, with one difference: velocity errors are taken in the heading
+//! frame (yawed but level), while SimpleFlight takes them in the tilted body frame. At the few
+//! degrees flown here the two agree to second order.
 
 use nalgebra::Vector3;
 
@@ -9,22 +10,22 @@ use super::VehicleState;
 use super::airframe::{Airframe, Gains};
 use super::rotors::RotorCommand;
 
-/// The controller's memory: only the climb loop integrates.
+/// State of the controller: only the climb loop integrates.
 #[derive(Debug, Clone)]
 pub(crate) struct Cascade {
-    /// Integral part of the throttle; starts at hover, as after a take-off.
+    /// Integral part of the throttle; starts at the hover command.
     throttle_integral: f32,
 }
 
 impl Cascade {
-    /// A controller trimmed for hover.
+    /// Returns a controller trimmed for hover.
     pub(crate) fn trimmed(airframe: &Airframe) -> Self {
         Self {
             throttle_integral: airframe.hover_command(),
         }
     }
 
-    /// Rotor commands that bring the drone to `velocity_mps` (heading frame) with yaw 0.
+    /// Returns the rotor command that brings the drone to `velocity_mps` (heading frame) at yaw 0.
     pub(crate) fn command(
         &mut self,
         gains: &Gains,
@@ -41,24 +42,29 @@ impl Cascade {
     }
 
     fn throttle(&mut self, gains: &Gains, climb_error_mps: f32, dt_secs: f32) -> f32 {
-        // Clamped, so that a long saturation cannot wind it up.
-        self.throttle_integral =
-            (self.throttle_integral + gains.throttle_per_m * climb_error_mps * dt_secs).clamp(0.0, 1.0);
-        (self.throttle_integral + gains.throttle_per_mps * climb_error_mps).clamp(gains.throttle_min, 1.0)
+        // Clamped to prevent windup in a long saturation.
+        self.throttle_integral = (self.throttle_integral
+            + gains.throttle_per_m * climb_error_mps * dt_secs)
+            .clamp(0.0, 1.0);
+        (self.throttle_integral + gains.throttle_per_mps * climb_error_mps)
+            .clamp(gains.throttle_min, 1.0)
     }
 }
 
-/// Roll, pitch and yaw asked for. Rolling left side up moves the drone to the right (−y), pitching nose down moves it forward.
+/// Returns the target roll, pitch and yaw. Rolling left side up moves the drone to the right (−y);
+/// pitching nose down moves it forward.
 fn attitude_target_rad(gains: &Gains, error_mps: &Vector3<f32>) -> Vector3<f32> {
-    let tilt = |error_mps: f32| (gains.tilt_per_mps * error_mps).clamp(-gains.tilt_limit_rad, gains.tilt_limit_rad);
+    let tilt = |error_mps: f32| {
+        (gains.tilt_per_mps * error_mps).clamp(-gains.tilt_limit_rad, gains.tilt_limit_rad)
+    };
     Vector3::new(-tilt(error_mps.y), tilt(error_mps.x), 0.0)
 }
 
 fn turn_command(gains: &Gains, state: &VehicleState, target_rad: &Vector3<f32>) -> Vector3<f32> {
     let (roll, pitch, yaw) = state.world_from_body.euler_angles();
     let limit = gains.rate_limit_radps;
-    let rate_target =
-        (target_rad - Vector3::new(roll, pitch, yaw)).map(|e| (gains.rate_per_rad * e).clamp(-limit, limit));
+    let rate_target = (target_rad - Vector3::new(roll, pitch, yaw))
+        .map(|e| (gains.rate_per_rad * e).clamp(-limit, limit));
     (rate_target - state.body_rates_radps).map(|e| (gains.command_per_radps * e).clamp(-1.0, 1.0))
 }
 
@@ -69,18 +75,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tilt_asked_for_never_exceeds_the_limit() {
+    fn target_tilt_never_exceeds_the_limit() {
         let gains = &Airframe::AIRSIM.gains;
-        let asked = attitude_target_rad(gains, &Vector3::new(100.0, 100.0, 0.0));
-        assert!((asked.x.to_degrees() + 32.7).abs() < 0.05);
-        assert!((asked.y.to_degrees() - 32.7).abs() < 0.05);
-        // One m/s of error asks for a fifth of it, as SimpleFlight's P of 0.2 says.
-        let asked = attitude_target_rad(gains, &Vector3::new(0.0, 1.0, 0.0));
-        assert!((asked.x + 0.2 * gains.tilt_limit_rad).abs() < 1e-6);
+        let target = attitude_target_rad(gains, &Vector3::new(100.0, 100.0, 0.0));
+        assert!((target.x.to_degrees() + 32.7).abs() < 0.05);
+        assert!((target.y.to_degrees() - 32.7).abs() < 0.05);
+        // An error of 1 m/s gives a fifth of the limit: SimpleFlight's P is 0.2.
+        let target = attitude_target_rad(gains, &Vector3::new(0.0, 1.0, 0.0));
+        assert!((target.x + 0.2 * gains.tilt_limit_rad).abs() < 1e-6);
     }
 
     #[test]
-    fn body_rate_asked_for_is_limited() {
+    fn target_body_rate_is_limited() {
         let gains = &Airframe::AIRSIM.gains;
         let on_its_side = VehicleState {
             world_from_body: UnitQuaternion::from_euler_angles(1.5, 0.0, 0.0),
@@ -97,7 +103,7 @@ mod tests {
         for _ in 0..100_000 {
             cascade.throttle(&airframe.gains, 5.0, 0.005);
         }
-        // From full saturation, a small sink error is answered at once.
+        // After full saturation, a small sink error takes effect at once.
         let throttle = cascade.throttle(&airframe.gains, -0.5, 0.005);
         assert!(throttle < 0.6, "{throttle}");
     }

@@ -1,15 +1,16 @@
-//! The drone: what it is (presets), how it is commanded, and what it exerts on its body at each physics step.
+//! The drone: its presets, its flight controller, and the force it exerts in each physics step.
 //!
-//! Three presets share one interface. `airsim` and `hummingbird` are quadrotors whose controller turns a velocity command into
-//! tilt, tilt into torques and torques into rotor thrust; `point` follows the command with a plain first-order lag.
-//! Nothing here integrates motion: that is rapier's part, in `world.rs`.
+//! Three presets share one interface. `airsim` and `hummingbird` are quadrotors: their controller
+//! turns a velocity command into tilt, tilt into torques, and torques into rotor thrust. `point`
+//! follows the command with a first-order lag. Nothing here integrates motion: rapier does, in
+//! `world.rs`.
 
 mod airframe;
 mod controller;
 mod rotors;
 mod settings;
 #[cfg(test)]
-mod step_response;
+mod step_response_tests;
 
 pub use settings::{Preset, VehicleSettings, VehicleSettingsError};
 
@@ -20,12 +21,13 @@ pub(crate) use airframe::GRAVITY_MPS2;
 use controller::Cascade;
 use rotors::Rotors;
 
-/// Where the drone is and how it moves. World frame: x along the corridor, y left, z up. Body frame: x forward, y left, z up.
+/// Pose and motion of the drone. World frame: x along the corridor, y left, z up. Body frame: x
+/// forward, y left, z up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VehicleState {
     /// Centre of mass, world frame, m.
     pub position_m: Point3<f32>,
-    /// Attitude: turns body vectors into world vectors.
+    /// Attitude: rotates body vectors into the world frame.
     pub world_from_body: UnitQuaternion<f32>,
     /// Velocity of the centre of mass, world frame, m/s.
     pub velocity_mps: Vector3<f32>,
@@ -34,7 +36,8 @@ pub struct VehicleState {
 }
 
 impl VehicleState {
-    /// Level and motionless at `position_m`, facing along the corridor.
+    /// Returns the state of a level, motionless drone at `position_m` that faces along the
+    /// corridor.
     pub fn at_rest(position_m: Point3<f32>) -> Self {
         Self {
             position_m,
@@ -44,27 +47,28 @@ impl VehicleState {
         }
     }
 
-    /// Position and attitude as one transform, as the depth camera takes it.
+    /// Returns position and attitude as one transform, world from body.
     pub fn pose(&self) -> Isometry3<f32> {
         Isometry3::from_parts(Translation3::from(self.position_m), self.world_from_body)
     }
 
-    /// Velocity in the heading frame: x where the nose points, y left of it, z up, m/s. What a real drone knows of itself.
+    /// Returns the velocity in the heading frame, m/s: x where the nose points, y left of it, z up.
+    /// A real drone can measure it.
     pub fn heading_velocity_mps(&self) -> Vector3<f32> {
         let (_, _, yaw) = self.world_from_body.euler_angles();
         UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw) * self.velocity_mps
     }
 }
 
-/// What the vehicle does to its rigid body during one physics step; world frame.
+/// Effect of the vehicle on its rigid body during one physics step, in the world frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Actuation {
-    /// Force at the centre of mass (gravity not included), N, and torque, N·m.
+    /// Force at the centre of mass without gravity, N, and torque, N·m.
     Wrench {
         force_n: Vector3<f32>,
         torque_nm: Vector3<f32>,
     },
-    /// Velocity to have during the step, m/s; the body neither falls nor turns.
+    /// Velocity during the step, m/s; the body neither falls nor turns.
     Velocity(Vector3<f32>),
 }
 
@@ -77,7 +81,7 @@ pub(crate) struct BodyProperties {
 }
 
 impl BodyProperties {
-    /// The same body of `factor` times the density.
+    /// Returns the same body with `factor` times the density.
     pub(crate) fn scaled(self, factor: f32) -> Self {
         Self {
             mass_kg: self.mass_kg * factor,
@@ -87,7 +91,7 @@ impl BodyProperties {
     }
 }
 
-/// A drone and its controller, as it stands at some moment of a flight.
+/// A drone and the state of its controller and rotors at a moment of an episode.
 #[derive(Debug, Clone)]
 pub(crate) enum Vehicle {
     Quadrotor {
@@ -101,7 +105,7 @@ pub(crate) enum Vehicle {
 }
 
 impl Vehicle {
-    /// The vehicle as it starts a flight: rotors and controller trimmed for hover.
+    /// Returns the vehicle at the start of an episode: rotors and controller trimmed for hover.
     pub(crate) fn trimmed(settings: &VehicleSettings) -> Self {
         let quadrotor = |airframe: Airframe| Self::Quadrotor {
             airframe,
@@ -117,7 +121,8 @@ impl Vehicle {
         }
     }
 
-    /// Mass and size of its body. The point drone borrows AirSim's: its size decides what it touches, its mass decides nothing.
+    /// Returns the body's mass and size. The point drone uses AirSim's: its size decides what it
+    /// touches, its mass has no effect.
     pub(crate) fn body(&self) -> BodyProperties {
         let airframe = match self {
             Self::Quadrotor { airframe, .. } => airframe,
@@ -130,8 +135,14 @@ impl Vehicle {
         }
     }
 
-    /// Lets controller and rotors work for `dt_secs` towards `velocity_mps` (heading frame).
-    pub(crate) fn actuate(&mut self, state: &VehicleState, velocity_mps: &Vector3<f32>, dt_secs: f32) -> Actuation {
+    /// Runs controller and rotors for `dt_secs` towards the velocity command `velocity_mps`
+    /// (heading frame).
+    pub(crate) fn actuate(
+        &mut self,
+        state: &VehicleState,
+        velocity_mps: &Vector3<f32>,
+        dt_secs: f32,
+    ) -> Actuation {
         match self {
             Self::Quadrotor {
                 airframe,
@@ -147,17 +158,22 @@ impl Vehicle {
                 }
             }
             Self::Point { time_constant_secs } => {
-                // The lag's exact answer over one step, so that the step's length does not show.
+                // The lag's exact solution over one step, so that the result does not depend on the
+                // step's length.
                 let reached = 1.0 - (-dt_secs / *time_constant_secs).exp();
-                Actuation::Velocity(state.velocity_mps + (velocity_mps - state.velocity_mps) * reached)
+                Actuation::Velocity(
+                    state.velocity_mps + (velocity_mps - state.velocity_mps) * reached,
+                )
             }
         }
     }
 }
 
-/// Quadratic drag, body frame, N.
+/// Returns the quadratic drag in the body frame, N.
 fn drag_n(airframe: &Airframe, state: &VehicleState) -> Vector3<f32> {
-    let velocity_mps = state.world_from_body.inverse_transform_vector(&state.velocity_mps);
+    let velocity_mps = state
+        .world_from_body
+        .inverse_transform_vector(&state.velocity_mps);
     -airframe
         .drag_n_per_mps2
         .component_mul(&velocity_mps.map(|v| v * v.abs()))
@@ -171,7 +187,7 @@ mod tests {
 
     #[test]
     fn heading_velocity_turns_with_the_nose_but_not_with_the_tilt() {
-        // Nose to the left, rolled: flying left is flying forward, and up stays up.
+        // Nose to the left and rolled: a motion to the left is forward, and up stays up.
         let state = VehicleState {
             world_from_body: UnitQuaternion::from_euler_angles(0.3, 0.0, FRAC_PI_2),
             velocity_mps: Vector3::new(0.0, 2.0, 0.5),
@@ -186,9 +202,14 @@ mod tests {
             velocity_mps: Vector3::new(2.0, 0.0, -1.0),
             ..VehicleState::at_rest(Point3::origin())
         };
-        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0264, 0.0, 0.1347)).norm() < 1e-5);
-        // Nose straight down: what was forward is now up for the body.
+        assert!(
+            (drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0264, 0.0, 0.1347)).norm() < 1e-5
+        );
+        // Nose straight down: the body's up axis now points forward in the world.
         state.world_from_body = UnitQuaternion::from_euler_angles(0.0, FRAC_PI_2, 0.0);
-        assert!((drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0066, 0.0, -4.0 * 0.1347)).norm() < 1e-5);
+        assert!(
+            (drag_n(&Airframe::AIRSIM, &state) - Vector3::new(-0.0066, 0.0, -4.0 * 0.1347)).norm()
+                < 1e-5
+        );
     }
 }

@@ -1,43 +1,45 @@
 //! Four rotors in X layout: mixing with saturation, first-order lag, thrust and reaction torque.
 //!
-//! The lag acts on thrust, as in AirSim; at 5 ms the difference to a lag on rotor speed cannot be seen.
+//! The lag acts on thrust, as in AirSim. At 5 ms, a lag on rotor speed would make no visible
+//! difference.
 
 use nalgebra::Vector3;
 
 use super::airframe::Airframe;
 
-/// One rotor's place (signs of x and y) and the sign of the torque about z with which the body answers its spin.
-struct Mount {
+/// Position of a rotor (signs of x and y), and sign of its reaction torque on the body about z.
+struct RotorMount {
     x: f32,
     y: f32,
     reaction: f32,
 }
 
-/// Front right and rear left turn counter-clockwise seen from above (the body answers clockwise, −z), the others clockwise.
-const MOUNTS: [Mount; 4] = [
-    Mount {
+/// The four rotors. Front right and rear left spin counter-clockwise seen from above, so their
+/// reaction on the body is clockwise (−z); the other two spin clockwise.
+const MOUNTS: [RotorMount; 4] = [
+    RotorMount {
         x: 1.0,
         y: -1.0,
         reaction: -1.0,
     },
-    Mount {
+    RotorMount {
         x: -1.0,
         y: 1.0,
         reaction: -1.0,
     },
-    Mount {
+    RotorMount {
         x: 1.0,
         y: 1.0,
         reaction: 1.0,
     },
-    Mount {
+    RotorMount {
         x: -1.0,
         y: -1.0,
         reaction: 1.0,
     },
 ];
 
-/// What the controller asks of the rotors together.
+/// Command of the controller to the four rotors together.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct RotorCommand {
     /// Collective, [0, 1].
@@ -55,20 +57,27 @@ pub(crate) struct RotorWrench {
     pub(crate) torque_nm: Vector3<f32>,
 }
 
-/// The rotors' state: the share of full thrust each gives now.
+/// State of the rotors: the share of full thrust that each gives.
 #[derive(Debug, Clone)]
 pub(crate) struct Rotors {
     thrusts: [f32; 4],
 }
 
 impl Rotors {
-    /// All four at `command`, as in steady hover.
+    /// Returns rotors that have settled at `command`, as in steady hover.
     pub(crate) fn at(command: f32) -> Self {
-        Self { thrusts: [command; 4] }
+        Self {
+            thrusts: [command; 4],
+        }
     }
 
-    /// Lets `dt_secs` pass under `command` and returns what the rotors exert at its end.
-    pub(crate) fn advance(&mut self, airframe: &Airframe, command: &RotorCommand, dt_secs: f32) -> RotorWrench {
+    /// Advances the rotors by `dt_secs` under `command` and returns their wrench at the end.
+    pub(crate) fn advance(
+        &mut self,
+        airframe: &Airframe,
+        command: &RotorCommand,
+        dt_secs: f32,
+    ) -> RotorWrench {
         let reached = 1.0 - (-dt_secs / airframe.rotor_lag_secs).exp();
         for (thrust, target) in self.thrusts.iter_mut().zip(mix(command)) {
             *thrust += reached * (target - *thrust);
@@ -85,7 +94,7 @@ impl Rotors {
         for (share, mount) in self.thrusts.iter().zip(&MOUNTS) {
             let thrust_n = share * airframe.rotor_thrust_n;
             wrench.thrust_n += thrust_n;
-            // r × F for a force along z at (x, y), and the spin's reaction.
+            // r × F for a force along z at (x, y), plus the reaction to the spin.
             wrench.torque_nm += Vector3::new(
                 mount.y * lever_m * thrust_n,
                 -mount.x * lever_m * thrust_n,
@@ -96,12 +105,14 @@ impl Rotors {
     }
 }
 
-/// Commands of the four rotors, each in [0, 1].
+/// Returns the commands of the four rotors, each in [0, 1].
 ///
-/// Out of reach, turning goes before climbing: a rotor below 0 lifts all four, one above 1 scales all four, as in SimpleFlight.
+/// In saturation, turning has priority over climbing, as in SimpleFlight: a rotor below 0 raises
+/// all four, a rotor above 1 scales all four down.
 fn mix(command: &RotorCommand) -> [f32; 4] {
     let mut outputs = MOUNTS.each_ref().map(|mount| {
-        command.throttle + mount.y * command.turn.x - mount.x * command.turn.y + mount.reaction * command.turn.z
+        command.throttle + mount.y * command.turn.x - mount.x * command.turn.y
+            + mount.reaction * command.turn.z
     });
     let least = outputs.iter().copied().fold(0.0, f32::min);
     let most = outputs.iter().copied().fold(f32::NEG_INFINITY, f32::max) - least;
@@ -118,20 +129,30 @@ mod tests {
 
     fn settled(turn: Vector3<f32>) -> RotorWrench {
         let mut rotors = Rotors::at(0.5);
-        rotors.advance(&Airframe::AIRSIM, &RotorCommand { throttle: 0.5, turn }, 1.0)
+        rotors.advance(
+            &Airframe::AIRSIM,
+            &RotorCommand {
+                throttle: 0.5,
+                turn,
+            },
+            1.0,
+        )
     }
 
     #[test]
-    fn full_thrust_and_torques_are_those_derived_by_hand() {
+    fn thrust_and_torques_equal_values_derived_by_hand() {
         let airframe = &Airframe::AIRSIM;
-        // Half throttle: 2 · 4.179 N. Command 0.1 about x: 4 rotors · 0.1 · 4.179 N · 0.2275/√2 m = 0.2689 N·m.
+        // Half throttle: 2 · 4.179 N. Command 0.1 about x: 4 rotors · 0.1 · 4.179 N · 0.2275/√2 m =
+        // 0.2689 N·m.
         let roll = settled(Vector3::new(0.1, 0.0, 0.0));
         assert!((roll.thrust_n - 8.358).abs() < 1e-4);
         assert!((roll.torque_nm - Vector3::new(0.2689, 0.0, 0.0)).norm() < 1e-4);
         let pitch = settled(Vector3::new(0.0, 0.1, 0.0));
         assert!((pitch.torque_nm - Vector3::new(0.0, 0.2689, 0.0)).norm() < 1e-4);
         let yaw = settled(Vector3::new(0.0, 0.0, 0.1));
-        assert!((yaw.torque_nm - Vector3::new(0.0, 0.0, 0.4 * airframe.rotor_torque_nm)).norm() < 1e-6);
+        assert!(
+            (yaw.torque_nm - Vector3::new(0.0, 0.0, 0.4 * airframe.rotor_torque_nm)).norm() < 1e-6
+        );
     }
 
     #[test]
@@ -160,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn hover_commands_are_those_of_the_sources() {
+    fn hover_commands_equal_those_of_the_sources() {
         assert!((Airframe::AIRSIM.hover_command() - 0.587).abs() < 1e-3);
         assert!((Airframe::HUMMINGBIRD.hover_command() - 0.3135).abs() < 1e-3);
     }

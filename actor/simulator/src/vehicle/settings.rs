@@ -1,32 +1,38 @@
-//! The vehicle's section of the configuration.
+//! The `[simulator.vehicle]` section of the configuration.
 
 use serde::{Deserialize, Serialize};
 
-/// Which drone flies.
+/// A drone that can be flown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// AirSim's generic quadrotor with its SimpleFlight controller: 1 kg, 0.98 m across, sluggish (lateral time constant 0.9 s).
+    /// AirSim's generic quadrotor with its SimpleFlight controller: 1 kg, 0.98 m across, sluggish
+    /// (lateral time constant 0.9 s).
     Airsim,
-    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.44 m across, lateral time constant 0.4 s.
+    /// AscTec Hummingbird with a quicker controller: 0.5 kg, 0.44 m across, lateral time constant
+    /// 0.4 s.
     Hummingbird,
-    /// No attitude, only a first-order velocity lag, in AirSim's collision body.
+    /// A drone without attitude: a first-order velocity lag in AirSim's collision body.
     Point,
 }
 
-/// Settings of the vehicle and of its control.
+/// The drone and its control: section `[simulator.vehicle]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VehicleSettings {
-    /// Which drone flies. Default `airsim`, the paper's.
+    /// The drone that flies. Default `airsim`, the paper's.
     pub preset: Preset,
-    /// Time between two actions, s. Default 0.5: within the 0.5 to 1 s that the paper's step counts allow.
+    /// Time between two actions, s, 0.01 to 5. Default 0.5: the paper's step counts imply 0.5 to
+    /// 1 s.
     pub control_period_secs: f32,
-    /// Least rate of physics and flight controller, Hz, 200 to 10,000. Default 200. Rounded up to whole steps per control period.
+    /// Least rate of physics and flight controller, Hz, 200 to 10,000. It is rounded up to whole
+    /// steps per control period. Default 200.
     pub physics_hz: f32,
-    /// Forward velocity commanded throughout a flight, m/s. Default 1, as in the paper.
+    /// Forward velocity commanded throughout an episode, m/s, 0.05 to 10. Default 1, as in the
+    /// paper.
     pub forward_speed_mps: f32,
-    /// Time constant of the `point` preset's velocity, s. Default 0.3; other presets ignore it.
+    /// Time constant of the `point` preset's velocity, s, 0.01 to 10; other presets ignore it.
+    /// Default 0.3.
     pub point_time_constant_secs: f32,
 }
 
@@ -54,7 +60,7 @@ impl VehicleSettings {
                 self.control_period_secs,
                 0.01,
                 5.0,
-                "the pilot could not steer",
+                "the policy could not steer",
             ),
             // The rate loop of `airsim` settles in 10 ms: below 200 Hz it oscillates.
             (
@@ -62,14 +68,14 @@ impl VehicleSettings {
                 self.physics_hz,
                 200.0,
                 10_000.0,
-                "the flight controller would be unstable, or a step take for ever",
+                "the flight controller would be unstable, or a step would take too long",
             ),
             (
                 "forward_speed_mps",
                 self.forward_speed_mps,
                 0.05,
                 10.0,
-                "the drone would never arrive, or cross surfaces between steps",
+                "the drone would never arrive, or would cross surfaces between two steps",
             ),
             (
                 "point_time_constant_secs",
@@ -80,7 +86,7 @@ impl VehicleSettings {
             ),
         ];
         for (key, value, least, most, consequence) in bounds {
-            // Written so that NaN is refused too.
+            // Written so that NaN is refused as well.
             if !(least..=most).contains(&value) {
                 return Err(VehicleSettingsError {
                     key,
@@ -94,10 +100,12 @@ impl VehicleSettings {
         Ok(())
     }
 
-    /// Physics steps in one control period, and the length of one, s.
+    /// Returns the number of physics steps in one control period, and the length of one, s.
     pub(crate) fn physics_steps(&self) -> (u32, f32) {
         // The small subtraction keeps 0.5 s · 200 Hz at 100 steps where the product rounds up.
-        let steps = (self.control_period_secs * self.physics_hz - 1e-3).ceil().max(1.0);
+        let steps = (self.control_period_secs * self.physics_hz - 1e-3)
+            .ceil()
+            .max(1.0);
         (steps as u32, self.control_period_secs / steps)
     }
 }
@@ -127,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn physics_never_runs_slower_than_asked() {
+    fn physics_never_runs_slower_than_configured() {
         let settings = VehicleSettings {
             control_period_secs: 0.333,
             physics_hz: 210.0,
@@ -139,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn not_a_number_is_refused_by_name() {
+    fn nan_is_refused_by_key() {
         let settings = VehicleSettings {
             forward_speed_mps: f32::NAN,
             ..Default::default()

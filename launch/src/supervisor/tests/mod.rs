@@ -1,6 +1,6 @@
-//! Supervision of small shell scripts that behave, or misbehave, as a learner and its actors may.
+//! Supervises small shell scripts that behave, or misbehave, like a learner and its actors.
 
-mod lives;
+mod incarnations;
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -13,17 +13,17 @@ use super::dismissal::ACTOR_GRACE;
 use super::*;
 use skein_protocol::config::Config;
 
-/// What was shown to the user.
+/// Everything that was shown to the user.
 #[derive(Default)]
 struct Seen {
-    flights: Vec<u64>,
+    episodes: Vec<u64>,
     warnings: String,
     restarts: Restarts,
 }
 
 impl Watcher for Seen {
-    fn progress(&mut self, progress: &Progress, restarts: Restarts) {
-        self.flights.push(progress.flights);
+    fn progress(&mut self, progress: &ProgressReport, restarts: Restarts) {
+        self.episodes.push(progress.episodes);
         self.restarts = restarts;
     }
 
@@ -33,22 +33,29 @@ impl Watcher for Seen {
     }
 }
 
-/// A shell function that reports so many updates, and these actors, both of them unless told otherwise.
-const REPORT: &str = r#"report() { echo '{"phase":"flying","flights":7,"total_flights":9,"evaluation_flights":[0,0],"steps":1,"updates":'$1',"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,"live_actors":'${2:-[0,1]}',"elapsed_secs":1.0}'; }"#;
+/// A shell function that reports `$1` updates and the live actors `$2`, by default both.
+const REPORT: &str = r#"report() {
+  printf '{"phase":"flying","episodes":7,"total_episodes":9,"evaluation_episodes":[0,0],'
+  printf '"steps":1,"updates":%s,"vae_updates":0,"steps_per_sec":1.0,"updates_per_sec":0.0,' "$1"
+  printf '"walls_passed":null,"mean_return":null,"temperature":null,"vae_loss":null,"actors":2,'
+  printf '"live_actors":%s,"elapsed_secs":1.0}\n' "${2:-[0,1]}"
+}"#;
 
-/// An actor that flies until the learner's script says stop.
+/// An actor that flies until the learner's script creates `stop`.
 const FAITHFUL_ACTOR: &str = "while [ ! -e $dir/stop ]; do sleep 0.02; done";
-/// A learner that runs until it is told to stop.
-const ENDLESS_LEARNER: &str = "trap 'touch $dir/saved $dir/stop; exit 0' TERM; report 0; while :; do sleep 0.02; done";
+/// A learner that runs until it gets SIGTERM.
+const ENDLESS_LEARNER: &str =
+    "trap 'touch $dir/saved $dir/stop; exit 0' TERM; report 0; while :; do sleep 0.02; done";
 
-struct Stage {
+struct ScriptedRun {
     directory: TempDir,
-    plan: Plan,
+    plan: SupervisionPlan,
 }
 
-impl Stage {
-    /// Two actors and a learner, given as shell commands that find the run's directory in `$dir` and the actor's id in `$id`. Each notes its process
-    /// id in the directory.
+impl ScriptedRun {
+    /// Creates a run of two actors and a learner, given as shell commands that find the run's
+    /// directory in `$dir` and the actor's id in `$id`. Each records its process id in the
+    /// directory.
     fn new(learner: &str, actor: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
@@ -67,7 +74,7 @@ impl Stage {
             learner: script("learner", learner),
             actor: script("actor", actor),
         };
-        let plan = Plan {
+        let plan = SupervisionPlan {
             run,
             programs,
             actors: vec![ActorId(0), ActorId(1)],
@@ -81,7 +88,7 @@ impl Stage {
         self.directory.path().join(name).exists()
     }
 
-    /// Supervises; `interrupt` is called with the sender of interruptions.
+    /// Supervises the run; `interrupt` gets the sender of interruptions.
     fn run<F: Future<Output = ()> + Send + 'static>(
         &self,
         interrupt: impl FnOnce(mpsc::Sender<()>) -> F,
@@ -100,7 +107,7 @@ impl Stage {
         (result, seen)
     }
 
-    /// Adds the actors to a run whose learner is not of our making.
+    /// Attaches the actors to a run whose learner this supervisor did not start.
     fn attach(&self) -> (Result<Ended, SupervisorError>, Seen) {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
@@ -114,16 +121,20 @@ impl Stage {
         (result, seen)
     }
 
-    /// The processes that were started.
+    /// Number of processes that were started.
     fn processes(&self) -> usize {
-        fs::read_to_string(self.directory.path().join("pids")).map_or(0, |pids| pids.lines().count())
+        fs::read_to_string(self.directory.path().join("pids"))
+            .map_or(0, |pids| pids.lines().count())
     }
 
-    /// Neither a process nor a zombie of those that were started.
+    /// Asserts that no started process is left, not even as a zombie.
     fn assert_nothing_is_left(&self) {
         let pids = fs::read_to_string(self.directory.path().join("pids")).unwrap();
         for pid in pids.lines() {
-            assert!(!Path::new("/proc").join(pid).exists(), "process {pid} is left");
+            assert!(
+                !Path::new("/proc").join(pid).exists(),
+                "process {pid} is left"
+            );
         }
     }
 }
@@ -138,31 +149,31 @@ async fn never(_: mpsc::Sender<()>) {}
 
 #[test]
 fn a_run_ends_when_its_learner_does() {
-    let stage = Stage::new("report 0; echo a remark; touch $dir/stop", FAITHFUL_ACTOR);
-    let (result, seen) = stage.run(never);
+    let scripted = ScriptedRun::new("report 0; echo a remark; touch $dir/stop", FAITHFUL_ACTOR);
+    let (result, seen) = scripted.run(never);
     assert_eq!(result.unwrap(), Ended::Finished);
-    assert_eq!(seen.flights, [7]);
+    assert_eq!(seen.episodes, [7]);
     assert_eq!(seen.warnings, "a remark\n");
 }
 
 #[test]
 fn a_dead_learner_is_not_started_again_during_a_stop() {
-    let dies_when_told = "trap 'kill -9 $$' TERM; report 0; while :; do sleep 0.02; done";
-    let stage = Stage::new(dies_when_told, FAITHFUL_ACTOR);
-    let pids = stage.plan.run.root().join("pids");
-    let (result, _) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+    let dies_when_stopped = "trap 'kill -9 $$' TERM; report 0; while :; do sleep 0.02; done";
+    let scripted = ScriptedRun::new(dies_when_stopped, FAITHFUL_ACTOR);
+    let pids = scripted.plan.run.root().join("pids");
+    let (result, _) = scripted.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
     let error = result.unwrap_err().to_string();
     assert!(error.contains("was killed by signal 9"), "{error}");
-    assert_eq!(stage.processes(), 3);
+    assert_eq!(scripted.processes(), 3);
 }
 
 #[test]
-fn an_interruption_between_two_lives_of_the_learner_ends_the_run() {
-    let stage = Stage::new("report 1; kill -9 $$", FAITHFUL_ACTOR);
-    let pids = stage.plan.run.root().join("pids");
+fn an_interruption_between_two_incarnations_of_the_learner_ends_the_run() {
+    let scripted = ScriptedRun::new("report 1; kill -9 $$", FAITHFUL_ACTOR);
+    let pids = scripted.plan.run.root().join("pids");
     let begun = std::time::Instant::now();
-    let (result, _) = stage.run(|interrupts| async move {
-        // Two lives, two actors; the third life begins after a pause of a second.
+    let (result, _) = scripted.run(|interrupts| async move {
+        // Two incarnations of the learner, two actors; the third begins after a pause of a second.
         until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 4)).await;
         tokio::time::sleep(Duration::from_millis(500)).await;
         interrupts.send(()).await.unwrap();
@@ -175,9 +186,9 @@ fn an_interruption_between_two_lives_of_the_learner_ends_the_run() {
 
 #[test]
 fn an_interruption_before_the_learner_knows_of_signals_ends_the_run_in_order() {
-    let stage = Stage::new("exec sleep 60", FAITHFUL_ACTOR);
-    let pids = stage.plan.run.root().join("pids");
-    let (result, _) = stage.run(|interrupts| async move {
+    let scripted = ScriptedRun::new("exec sleep 60", FAITHFUL_ACTOR);
+    let pids = scripted.plan.run.root().join("pids");
+    let (result, _) = scripted.run(|interrupts| async move {
         until(|| pids.exists()).await;
         tokio::time::sleep(Duration::from_millis(100)).await;
         interrupts.send(()).await.unwrap();
@@ -186,12 +197,12 @@ fn an_interruption_before_the_learner_knows_of_signals_ends_the_run_in_order() {
 }
 
 #[test]
-fn a_learner_that_fails_ends_the_run_and_its_last_words_are_told() {
-    let stage = Stage::new(
+fn a_learner_that_fails_ends_the_run_and_its_last_words_are_printed() {
+    let scripted = ScriptedRun::new(
         "report 0; echo 'no such device' >&2; exit 3",
         "while :; do sleep 0.02; done",
     );
-    let (result, _) = stage.run(never);
+    let (result, _) = scripted.run(never);
     let error = result.unwrap_err().to_string();
     assert!(
         error.contains("exited with status 3") && error.contains("learner.log"),
@@ -202,36 +213,39 @@ fn a_learner_that_fails_ends_the_run_and_its_last_words_are_told() {
 
 #[test]
 fn actors_that_keep_dying_end_the_run_but_what_was_learned_is_saved() {
-    let stage = Stage::new(ENDLESS_LEARNER, "echo 'cannot fly' >&2; exit 1");
-    let (result, _) = stage.run(never);
+    let scripted = ScriptedRun::new(ENDLESS_LEARNER, "echo 'cannot fly' >&2; exit 1");
+    let (result, _) = scripted.run(never);
     let error = result.unwrap_err().to_string();
     assert!(
         error.contains("no actor is left") && error.contains("cannot fly"),
         "{error}"
     );
-    assert!(stage.has("saved"));
+    assert!(scripted.has("saved"));
 }
 
 #[test]
 fn the_first_interruption_stops_in_order() {
-    let stage = Stage::new(ENDLESS_LEARNER, FAITHFUL_ACTOR);
-    let learner_up = stage.plan.run.root().join("pids");
-    let (result, _) = stage.run(|interrupts| async move {
+    let scripted = ScriptedRun::new(ENDLESS_LEARNER, FAITHFUL_ACTOR);
+    let learner_up = scripted.plan.run.root().join("pids");
+    let (result, _) = scripted.run(|interrupts| async move {
         until(|| fs::read_to_string(&learner_up).is_ok_and(|pids| pids.lines().count() == 3)).await;
         tokio::time::sleep(Duration::from_millis(200)).await;
         interrupts.send(()).await.unwrap();
     });
     assert_eq!(result.unwrap(), Ended::Interrupted);
-    assert!(stage.has("saved"), "the learner was not given time to save");
+    assert!(
+        scripted.has("saved"),
+        "the learner was not given time to save"
+    );
 }
 
 #[test]
 fn the_second_interruption_stops_at_once() {
     let deaf = "trap '' TERM; report 0; while :; do sleep 0.02; done";
-    let stage = Stage::new(deaf, deaf);
-    let pids = stage.plan.run.root().join("pids");
+    let scripted = ScriptedRun::new(deaf, deaf);
+    let pids = scripted.plan.run.root().join("pids");
     let begun = std::time::Instant::now();
-    let (result, _) = stage.run(|interrupts| async move {
+    let (result, _) = scripted.run(|interrupts| async move {
         until(|| fs::read_to_string(&pids).is_ok_and(|pids| pids.lines().count() == 3)).await;
         interrupts.send(()).await.unwrap();
         interrupts.send(()).await.unwrap();
@@ -242,93 +256,101 @@ fn the_second_interruption_stops_at_once() {
 
 #[test]
 fn a_program_that_cannot_be_started_leaves_nothing_behind() {
-    let mut stage = Stage::new(ENDLESS_LEARNER, "");
-    stage.plan.programs.actor = PathBuf::from("/nowhere/skein-actor");
+    let mut scripted = ScriptedRun::new(ENDLESS_LEARNER, "");
+    let missing = tempfile::tempdir().unwrap().path().join("skein-actor");
+    scripted.plan.programs.actor = missing.clone();
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
         .unwrap();
     let (_sender, mut interrupts) = mpsc::channel(1);
     let error = runtime
-        .block_on(run(&stage.plan, &mut interrupts, &mut Seen::default()))
+        .block_on(run(&scripted.plan, &mut interrupts, &mut Seen::default()))
         .unwrap_err();
-    assert!(error.to_string().contains("/nowhere/skein-actor"), "{error}");
-    if stage.has("pids") {
-        stage.assert_nothing_is_left();
+    assert!(
+        error.to_string().contains(missing.to_str().unwrap()),
+        "{error}"
+    );
+    if scripted.has("pids") {
+        scripted.assert_nothing_is_left();
     }
 }
 
 #[test]
-fn a_learner_that_cannot_start_is_quoted_once_and_no_actor_is_started() {
-    let stage = Stage::new(
+fn a_learner_that_cannot_start_is_quoted_once_and_no_actor_starts() {
+    let scripted = ScriptedRun::new(
         "echo '2026-01-01 ERROR no such device' >&2; echo 'learner: no such device' >&2; exit 1",
         FAITHFUL_ACTOR,
     );
-    let (result, seen) = stage.run(never);
+    let (result, seen) = scripted.run(never);
     assert_eq!(
         result.unwrap_err().to_string(),
         "the learner cannot start: no such device"
     );
-    assert_eq!((&*seen.warnings, stage.processes()), ("", 1));
+    assert_eq!((&*seen.warnings, scripted.processes()), ("", 1));
 }
 
 #[test]
 fn actors_that_find_no_learner_are_not_started_again() {
-    let stage = Stage::new("", "exit 3");
-    let (result, _) = stage.attach();
+    let scripted = ScriptedRun::new("", "exit 3");
+    let (result, _) = scripted.attach();
     let error = result.unwrap_err().to_string();
     assert_eq!(
         error,
-        format!("the learner of {} is gone", stage.directory.path().display())
+        format!(
+            "the learner of the run in {} has ended",
+            scripted.directory.path().display()
+        )
     );
-    assert_eq!(stage.processes(), 2);
+    assert_eq!(scripted.processes(), 2);
 }
 
 #[test]
 fn attached_actors_that_cannot_leave_are_ended_after_the_run() {
-    let mut stage = Stage::new("", "touch $dir/over; kill -STOP $$");
-    stage.plan.deadlines.actor_silence = Duration::from_millis(100);
-    let (result, _) = stage.attach();
+    let mut scripted = ScriptedRun::new("", "touch $dir/over; kill -STOP $$");
+    scripted.plan.deadlines.actor_silence = Duration::from_millis(100);
+    let (result, _) = scripted.attach();
     assert_eq!(result.unwrap(), Ended::Finished);
 }
 
-/// A learner that goes on reporting for a second after it is told to stop, with `$n` counting up, and then saves.
-fn slow_to_stop(report: &str) -> Stage {
+/// A learner that keeps reporting for a second after SIGTERM, with `$n` counting up, and then
+/// saves.
+fn slow_to_stop(report: &str) -> ScriptedRun {
     let learner = format!(
-        "trap 'told=1' TERM; n=0; report 0; while [ -z $told ]; do sleep 0.02; done
+        "trap 'stopping=1' TERM; n=0; report 0; while [ -z $stopping ]; do sleep 0.02; done
         while [ $n -lt 10 ]; do n=$((n+1)); {report}; sleep 0.1; done; touch $dir/saved $dir/stop"
     );
-    let mut stage = Stage::new(&learner, FAITHFUL_ACTOR);
-    stage.plan.deadlines.learner_stop = Duration::from_millis(500);
-    stage
+    let mut scripted = ScriptedRun::new(&learner, FAITHFUL_ACTOR);
+    scripted.plan.deadlines.learner_stop = Duration::from_millis(500);
+    scripted
 }
 
 #[test]
 fn a_learner_that_still_updates_is_given_time_to_save() {
-    let stage = slow_to_stop("report $n");
-    let pids = stage.plan.run.root().join("pids");
-    let (result, seen) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+    let scripted = slow_to_stop("report $n");
+    let pids = scripted.plan.run.root().join("pids");
+    let (result, seen) = scripted.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
     assert_eq!(result.unwrap(), Ended::Interrupted);
-    assert!(stage.has("saved"));
+    assert!(scripted.has("saved"));
     assert_eq!(
         seen.warnings
-            .matches("finishing the updates of this epoch; Ctrl-C again")
+            .matches("finishing the updates of this epoch, then saving; press Ctrl-C again")
             .count(),
         1
     );
 }
 
 #[test]
-fn a_learner_that_only_repeats_itself_is_killed() {
-    let stage = slow_to_stop("report 0");
-    let pids = stage.plan.run.root().join("pids");
-    let (result, seen) = stage.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
+fn a_stopping_learner_without_progress_is_killed() {
+    let scripted = slow_to_stop("report 0");
+    let pids = scripted.plan.run.root().join("pids");
+    let (result, seen) = scripted.run(|interrupts| interrupt_when_all_fly(pids, interrupts));
     assert!(
         matches!(result, Err(SupervisorError::LearnerFailed { .. })),
         "{result:?}"
     );
     assert!(
-        !stage.has("saved") && seen.warnings.contains("killed"),
+        !scripted.has("saved") && seen.warnings.contains("does not stop: killing it"),
         "{}",
         seen.warnings
     );

@@ -1,4 +1,5 @@
-//! A critic's two estimates of Q on the kernels, from one network with two outputs or from two networks with one.
+//! The critic's two estimates of Q on the native kernels, from one network with two outputs or from
+//! two networks with one output each.
 
 use std::ops::Range;
 
@@ -8,25 +9,26 @@ use super::dense::{Dense, Layers, output, output_mut};
 use super::rows::ESTIMATES;
 use crate::networks::Layout;
 
-/// The networks, which are alike; their parameters lie one behind the other.
+/// One or two networks of equal shape; their parameters lie one after the other.
 #[derive(Debug)]
 pub struct NativeCritic {
     network: Dense,
     networks: usize,
-    /// Parameters of one.
+    /// Number of parameters of one network.
     len: usize,
 }
 
-/// What the networks gave for some rows, or what flows back.
+/// Activations of the critic's networks for some rows, or the loss's gradients with respect
+/// to them.
 #[derive(Debug, Default)]
 pub struct CriticLayers {
     networks: Vec<Layers>,
-    /// Both estimates, `[rows, 2]`.
+    /// Both estimates, `[rows, 2]`, or the gradient with respect to them.
     pub values: Vec<f32>,
 }
 
 impl NativeCritic {
-    /// The critic that `layout` describes, of one network or of two.
+    /// Returns the critic that `layout` describes, made of `networks` networks.
     pub fn new(isa: Isa, layout: &Layout, networks: usize) -> Self {
         let tensors = &layout.tensors()[..layout.tensors().len() / networks];
         Self {
@@ -36,92 +38,126 @@ impl NativeCritic {
         }
     }
 
-    /// Places for what is computed of so many rows.
-    pub fn places(&self, rows: usize) -> CriticLayers {
+    /// Allocates buffers for the activations of `rows` rows.
+    pub fn allocate(&self, rows: usize) -> CriticLayers {
         CriticLayers {
-            networks: (0..self.networks).map(|_| self.network.places(rows)).collect(),
+            networks: (0..self.networks)
+                .map(|_| self.network.allocate(rows))
+                .collect(),
             values: vec![0.0; rows * ESTIMATES],
         }
     }
 
-    /// Both estimates for `joined`, `[rows, observation + 2]`, and what the layers gave on the way.
-    pub fn forward(&self, team: &mut Team, parameters: &[f32], joined: &[f32], given: &mut CriticLayers) {
-        for (number, layers) in given.networks.iter_mut().enumerate() {
-            self.network.forward(team, self.of(number, parameters), joined, layers);
-            scatter(output(layers), number, &mut given.values);
+    /// Computes both estimates for `joined`, `[rows, critic input + 2]`; keeps all activations in
+    /// `activations`.
+    pub fn forward(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        joined: &[f32],
+        activations: &mut CriticLayers,
+    ) {
+        for (number, layers) in activations.networks.iter_mut().enumerate() {
+            self.network
+                .forward(team, self.of(number, parameters), joined, layers);
+            scatter(output(layers), number, &mut activations.values);
         }
     }
 
-    /// Both estimates alone, `[rows, 2]`.
-    pub fn forward_through(&self, team: &mut Team, parameters: &[f32], joined: &[f32], values: &mut [f32]) {
+    /// Computes only both estimates, `[rows, 2]`.
+    pub fn forward_through(
+        &self,
+        team: &mut Team,
+        parameters: &[f32],
+        joined: &[f32],
+        values: &mut [f32],
+    ) {
         let mut own = vec![0.0; values.len() / self.networks];
         for number in 0..self.networks {
             let parameters = self.of(number, parameters);
-            self.network.forward_through(team, parameters, joined, &mut own);
+            self.network
+                .forward_through(team, parameters, joined, &mut own);
             scatter(&own, number, values);
         }
     }
 
-    /// The gradient of all parameters, from what flows back to the estimates, `flowing.values`.
+    /// Computes the gradient with respect to all parameters, from the gradient with respect to the
+    /// estimates, `grad.values`.
     pub fn gradient(
         &self,
         team: &mut Team,
         parameters: &[f32],
         joined: &[f32],
-        given: &CriticLayers,
-        flowing: &mut CriticLayers,
+        activations: &CriticLayers,
+        grad: &mut CriticLayers,
         into: &mut [f32],
     ) {
-        for (number, layers) in flowing.networks.iter_mut().enumerate() {
-            gather(&flowing.values, number, output_mut(layers));
-            let (parameters, given) = (self.of(number, parameters), &given.networks[number]);
-            self.network.backward(team, parameters, given, layers);
+        for (number, layers) in grad.networks.iter_mut().enumerate() {
+            gather(&grad.values, number, output_mut(layers));
+            let (parameters, activations) =
+                (self.of(number, parameters), &activations.networks[number]);
+            self.network.backward(team, parameters, activations, layers);
             let into = &mut into[number * self.len..][..self.len];
-            self.network.gradient(team, joined, given, layers, into);
+            self.network
+                .gradient(team, joined, activations, layers, into);
         }
     }
 
-    /// What flows back to some columns of the input, `[rows, columns]`, from what flows to the estimates, `[rows, 2]`.
+    /// Computes the gradient with respect to some columns of the input, `[rows, columns]`, from the
+    /// gradient with respect to the estimates, `[rows, 2]`.
     pub fn backward_through(
         &self,
         team: &mut Team,
         parameters: &[f32],
-        given: &CriticLayers,
-        flowing: &[f32],
+        activations: &CriticLayers,
+        grad: &[f32],
         columns: Range<usize>,
         into: &mut [f32],
     ) {
-        let mut own_flowing = vec![0.0; flowing.len() / self.networks];
+        let mut own_grad = vec![0.0; grad.len() / self.networks];
         let mut own = vec![0.0; into.len()];
         into.fill(0.0);
-        for (number, given) in given.networks.iter().enumerate() {
-            gather(flowing, number, &mut own_flowing);
+        for (number, activations) in activations.networks.iter().enumerate() {
+            gather(grad, number, &mut own_grad);
             let parameters = self.of(number, parameters);
             let columns = columns.clone();
-            self.network
-                .backward_through(team, parameters, given, &own_flowing, columns, &mut own);
+            self.network.backward_through(
+                team,
+                parameters,
+                activations,
+                &own_grad,
+                columns,
+                &mut own,
+            );
             into.iter_mut().zip(&own).for_each(|(sum, own)| *sum += own);
         }
     }
 
-    /// The parameters of one network.
+    /// Slice of the parameters that belongs to network `number`.
     fn of<'a>(&self, number: usize, parameters: &'a [f32]) -> &'a [f32] {
         &parameters[number * self.len..][..self.len]
     }
 }
 
-/// Writes what network `number` gave, `[rows, estimates of it]`, to its place among the estimates.
+/// Copies the output of network `number`, `[rows, outputs]`, to its columns of `values`,
+/// `[rows, 2]`.
 fn scatter(own: &[f32], number: usize, values: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
-    for (own, values) in own.chunks_exact(each).zip(values.chunks_exact_mut(ESTIMATES)) {
+    for (own, values) in own
+        .chunks_exact(each)
+        .zip(values.chunks_exact_mut(ESTIMATES))
+    {
         values[number * each..][..each].copy_from_slice(own);
     }
 }
 
-/// Reads what network `number` gave from among the estimates: the other way round.
+/// Copies the columns of network `number` out of `values`; the inverse of [`scatter`].
 fn gather(values: &[f32], number: usize, own: &mut [f32]) {
     let each = ESTIMATES * own.len() / values.len();
-    for (own, values) in own.chunks_exact_mut(each).zip(values.chunks_exact(ESTIMATES)) {
+    for (own, values) in own
+        .chunks_exact_mut(each)
+        .zip(values.chunks_exact(ESTIMATES))
+    {
         own.copy_from_slice(&values[number * each..][..each]);
     }
 }

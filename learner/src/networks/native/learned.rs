@@ -1,15 +1,15 @@
-//! A vector that is learned: its numbers, their gradient, and what Adam remembers of earlier ones.
+//! A learned vector: its values, their gradient, and Adam's two moments.
 
 use skein_kernels::{AdamStep, Isa, Team};
 
-use crate::state::Part;
+use crate::state::StatePart;
 
-/// A network's parameters, or log α.
+/// A network's parameters, or log α, with the state of its optimizer.
 #[derive(Debug)]
 pub struct Learned {
-    /// Its numbers.
+    /// Present values.
     pub values: Vec<f32>,
-    /// What the next step goes against.
+    /// Gradient for the next step.
     pub gradient: Vec<f32>,
     first_moment: Vec<f32>,
     second_moment: Vec<f32>,
@@ -18,7 +18,7 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Before its first step.
+    /// Returns the vector before its first step.
     pub fn new(values: Vec<f32>, learning_rate: f64) -> Self {
         let zeros = || vec![0.0; values.len()];
         Self {
@@ -31,12 +31,12 @@ impl Learned {
         }
     }
 
-    /// Steps done so far.
+    /// Number of steps done so far.
     pub fn steps(&self) -> u64 {
         self.steps
     }
 
-    /// One step of Adam against the gradient.
+    /// Makes one step of Adam against the gradient.
     pub fn step(&mut self, team: &mut Team, isa: Isa) {
         self.steps += 1;
         let step = AdamStep {
@@ -48,17 +48,24 @@ impl Learned {
     }
 
     /// The values under `name`, and Adam's state under names that begin with `adam`.
-    pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, Part<'_>)> {
+    pub fn parts(&mut self, name: &str, adam: &str) -> Vec<(String, StatePart<'_>)> {
         vec![
-            (name.to_owned(), Part::Numbers(&mut self.values)),
-            (format!("{adam}.first_moment"), Part::Numbers(&mut self.first_moment)),
-            (format!("{adam}.second_moment"), Part::Numbers(&mut self.second_moment)),
-            (format!("{adam}.steps"), Part::Count(&mut self.steps)),
+            (name.to_owned(), StatePart::Numbers(&mut self.values)),
+            (
+                format!("{adam}.first_moment"),
+                StatePart::Numbers(&mut self.first_moment),
+            ),
+            (
+                format!("{adam}.second_moment"),
+                StatePart::Numbers(&mut self.second_moment),
+            ),
+            (format!("{adam}.steps"), StatePart::Count(&mut self.steps)),
         ]
     }
 }
 
-/// Squared length of a gradient: infinite or not a number if one of its numbers is, or if it overflows. Sixteen sums side by side, the same on every processor.
+/// Squared norm of a gradient. It is not finite if an element is not, or if it overflows. Sixteen
+/// partial sums keep the order of addition equal with every instruction set.
 pub fn squared_norm(isa: Isa, gradient: &[f32]) -> f32 {
     isa.vectorised(
         #[inline(always)]

@@ -1,4 +1,4 @@
-//! Networks on the kernels, forward and backward written out, and the vectors that they learn.
+//! Networks on the native kernels, forward and backward written out, and their learned vectors.
 
 mod critic;
 mod dense;

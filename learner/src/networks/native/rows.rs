@@ -1,12 +1,12 @@
-//! What every actor-critic does with rows of a critic and with a target network.
+//! Row operations that every actor-critic needs, and the step of a target network.
 
 use skein_kernels::{Isa, Team};
 use skein_protocol::ACTION;
 
-/// Q estimates of a critic.
+/// Q estimates per row of a critic.
 pub const ESTIMATES: usize = 2;
 
-/// Rows of observations and actions side by side.
+/// Concatenates observations and actions row by row.
 pub fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
     let rows = actions.len() / ACTION;
     let (observation, width) = (observations.len() / rows, into.len() / rows);
@@ -16,17 +16,21 @@ pub fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
     }
 }
 
-/// A row's two estimates.
+/// Both estimates of one row.
 pub fn pair(values: &[f32], row: usize) -> [f32; ESTIMATES] {
     [values[row * ESTIMATES], values[row * ESTIMATES + 1]]
 }
 
-/// The smaller estimate; not a number if one of them is none.
+/// The smaller estimate; NaN if either of them is NaN.
 pub fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
-    if one < other || one.is_nan() { one } else { other }
+    if one < other || one.is_nan() {
+        one
+    } else {
+        other
+    }
 }
 
-/// Moves a target network by the share `rate` towards its leader.
+/// Moves a target network towards its leader, by the fraction `rate` of their difference.
 pub fn follow(team: &mut Team, isa: Isa, target: &mut [f32], leader: &[f32], rate: f32) {
     /// Numbers that stay together: whole cache lines.
     const GRAIN: usize = 1024;

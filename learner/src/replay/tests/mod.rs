@@ -9,12 +9,12 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_PIXELS, TRUE_STATE};
+use skein_protocol::{IMAGE_PIXELS, PRIVILEGED_STATE};
 
 use super::*;
-use crate::flight::samples::{code, flight, shade, with_images};
+use crate::episode::samples::{code, episode, shade, with_images};
 
-/// Length of the codes.
+/// Length of the latent codes.
 const LATENT: usize = 16;
 
 fn config(capacity: usize, observation: Observation) -> Config {
@@ -41,7 +41,7 @@ fn encode(images: &[u8]) -> Result<Vec<LatentCode>, Infallible> {
         .collect())
 }
 
-/// What the final encoder makes of an image, in contrast to [`code`].
+/// Code of an image under the final encoder, different from [`code`].
 fn final_code(shade: u8) -> LatentCode {
     code(shade).map(|value| -value - 1.0)
 }
@@ -49,13 +49,17 @@ fn final_code(shade: u8) -> LatentCode {
 #[test]
 fn a_minibatch_holds_the_configured_share_of_success() {
     let mut replay = frozen(&config(1000, Observation::Latent));
-    let mut crossing = flight(1, 20, Outcome::Collided);
+    let mut crossing = episode(1, 20, Outcome::Collided);
     crossing.level_up[7] = true;
     replay.insert(crossing).unwrap();
     let mut batch = Minibatch::default();
     for (count, success) in [(256, 64), (8, 2), (2, 1), (1, 0)] {
         replay.sample(&mut Pcg64Mcg::seed_from_u64(1), count, &mut batch);
-        let marked = batch.rewards.iter().filter(|&&reward| reward == 10.07).count();
+        let marked = batch
+            .rewards
+            .iter()
+            .filter(|&&reward| reward == 10.07)
+            .count();
         assert_eq!((batch.rewards.len(), marked), (count, success));
         assert_eq!(batch.observations.len(), count * LATENT);
         assert_eq!(batch.next_observations.len(), count * LATENT);
@@ -64,81 +68,88 @@ fn a_minibatch_holds_the_configured_share_of_success() {
     }
 }
 
-/// `flight` in legs of `steps` steps, each with the images of all that it saw.
-fn in_legs(flight: &CommittedFlight, steps: usize) -> Vec<CommittedFlight> {
-    let leg = |first: usize| {
-        let end = (first + steps).min(flight.steps());
-        let is_last = end == flight.steps();
-        let images = &flight.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
-        CommittedFlight {
+/// Splits `episode` into segments of `steps` steps, each with the images of all its observations.
+fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode> {
+    let segment = |first: usize| {
+        let end = (first + steps).min(episode.steps());
+        let is_last = end == episode.steps();
+        let images =
+            &episode.depth.as_ref().unwrap()[first * IMAGE_PIXELS..(end + 1) * IMAGE_PIXELS];
+        CommittedEpisode {
             first_step: first,
             action_before: first
                 .checked_sub(1)
-                .map_or([0.0; ACTION], |before| flight.actions[before]),
-            observations: flight.observations[first..=end].to_vec(),
-            actions: flight.actions[first..end].to_vec(),
-            rewards: flight.rewards[first..end].to_vec(),
-            reward_terms: flight.reward_terms[first..end].to_vec(),
-            level_up: flight.level_up[first..end].to_vec(),
-            outcome: flight.outcome.filter(|_| is_last),
+                .map_or([0.0; ACTION], |before| episode.actions[before]),
+            observations: episode.observations[first..=end].to_vec(),
+            actions: episode.actions[first..end].to_vec(),
+            rewards: episode.rewards[first..end].to_vec(),
+            reward_terms: episode.reward_terms[first..end].to_vec(),
+            level_up: episode.level_up[first..end].to_vec(),
+            outcome: episode.outcome.filter(|_| is_last),
             depth: Some(images.to_vec()),
-            ..flight.without_images()
+            ..episode.without_images()
         }
     };
-    (0..flight.steps()).step_by(steps).map(leg).collect()
+    (0..episode.steps()).step_by(steps).map(segment).collect()
 }
 
 #[test]
-fn a_flight_stored_in_legs_is_the_flight_stored_whole() {
-    for (steps, outcome) in [(1, Outcome::Collided), (3, Outcome::TimedOut), (7, Outcome::ReachedEnd)] {
+fn an_episode_stored_in_segments_is_the_episode_stored_whole() {
+    for (steps, outcome) in [
+        (1, Outcome::Collided),
+        (3, Outcome::TimedOut),
+        (7, Outcome::ReachedEnd),
+    ] {
         let config = config(1000, Observation::LatentVelocityAction);
-        let (mut whole, mut legs) = (Replay::new(&config), Replay::new(&config));
+        let (mut whole, mut segments) = (Replay::new(&config), Replay::new(&config));
         for number in 0..3 {
-            let mut flown = with_images(flight(number, 7, outcome));
+            let mut flown = with_images(episode(number, 7, outcome));
             flown.level_up[5] = true;
-            let parts = in_legs(&flown, steps);
+            let parts = in_segments(&flown, steps);
             let mut joined = parts[0].without_images();
-            parts[1..].iter().for_each(|leg| joined.extend(leg));
+            parts[1..].iter().for_each(|segment| joined.extend(segment));
             assert_eq!(joined, flown.without_images());
-            parts.into_iter().for_each(|leg| legs.insert(leg).unwrap());
+            parts
+                .into_iter()
+                .for_each(|segment| segments.insert(segment).unwrap());
             whole.insert(flown).unwrap();
         }
-        assert_eq!(legs.state(), whole.state());
-        legs.renew_latents(4, encode).unwrap();
-        whole.renew_latents(4, encode).unwrap();
-        assert_eq!(legs.state(), whole.state());
+        assert_eq!(segments.state(), whole.state());
+        segments.recode_latents(4, encode).unwrap();
+        whole.recode_latents(4, encode).unwrap();
+        assert_eq!(segments.state(), whole.state());
     }
 }
 
 #[test]
-fn a_leg_that_does_not_follow_what_was_stored_last_is_refused() {
-    let legs = |number| in_legs(&with_images(flight(number, 6, Outcome::Collided)), 2);
+fn a_segment_that_does_not_follow_what_was_stored_last_is_refused() {
+    let segments = |number| in_segments(&with_images(episode(number, 6, Outcome::Collided)), 2);
     let config = config(1000, Observation::Latent);
     let mut replay = Replay::new(&config);
-    let refused = |leg: CommittedFlight, replay: &mut Replay| {
+    let refused = |segment: CommittedEpisode, replay: &mut Replay| {
         let before = replay.state();
-        let error = replay.insert(leg).unwrap_err().to_string();
+        let error = replay.insert(segment).unwrap_err().to_string();
         assert_eq!(replay.state(), before);
-        assert!(error.contains("flight 4 from its step 2 on"), "{error}");
+        assert!(error.contains("episode 4 from its step 2 on"), "{error}");
     };
-    refused(legs(4).remove(1), &mut replay);
-    replay.insert(legs(3).remove(0)).unwrap();
-    refused(legs(4).remove(1), &mut replay);
-    replay.insert(legs(4).remove(0)).unwrap();
-    replay.insert(legs(4).remove(1)).unwrap();
-    refused(legs(4).remove(1), &mut replay);
+    refused(segments(4).remove(1), &mut replay);
+    replay.insert(segments(3).remove(0)).unwrap();
+    refused(segments(4).remove(1), &mut replay);
+    replay.insert(segments(4).remove(0)).unwrap();
+    replay.insert(segments(4).remove(1)).unwrap();
+    refused(segments(4).remove(1), &mut replay);
     let mut restored = Replay::restore(&config, replay.state()).unwrap();
     assert!(
-        restored.insert(legs(4).remove(2)).is_err(),
-        "a checkpoint lies between flights"
+        restored.insert(segments(4).remove(2)).is_err(),
+        "a checkpoint lies between episodes"
     );
 }
 
 #[test]
-fn an_empty_part_is_made_up_for_by_the_other() {
+fn the_other_part_makes_up_for_an_empty_one() {
     for level_up in [false, true] {
         let mut replay = frozen(&config(1000, Observation::Latent));
-        let mut one_sided = flight(1, 20, Outcome::Collided);
+        let mut one_sided = episode(1, 20, Outcome::Collided);
         one_sided.level_up.fill(level_up);
         replay.insert(one_sided).unwrap();
         let mut batch = Minibatch::default();
@@ -148,21 +159,25 @@ fn an_empty_part_is_made_up_for_by_the_other() {
 }
 
 #[test]
-fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() {
+fn without_a_success_share_the_buffer_is_one_part_and_marks_no_success() {
     let mut config = config(1000, Observation::Latent);
     config.replay.success_share = 0.0;
     let mut replay = frozen(&config);
     for number in 0..50 {
-        let mut crossing = flight(number, 20, Outcome::Collided);
+        let mut crossing = episode(number, 20, Outcome::Collided);
         crossing.level_up[7] = true;
         replay.insert(crossing).unwrap();
     }
     assert_eq!((replay.len(), replay.success_len()), (1000, 0));
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 20_000, &mut batch);
-    // The level-up of the newest flight is one transition of a thousand.
+    // The level-up of the newest episode is one transition of a thousand.
     let level_up = 49_007.0_f32 / 100.0;
-    let drawn = batch.rewards.iter().filter(|&&reward| reward == level_up).count();
+    let drawn = batch
+        .rewards
+        .iter()
+        .filter(|&&reward| reward == level_up)
+        .count();
     assert!((5..50).contains(&drawn), "{drawn}");
     assert_eq!(
         Replay::restore(&config, replay.state()).unwrap().state(),
@@ -173,7 +188,7 @@ fn without_a_success_share_the_whole_buffer_is_one_part_that_knows_no_success() 
 #[test]
 fn every_transition_of_a_part_is_equally_likely() {
     let mut replay = frozen(&config(1000, Observation::Latent));
-    replay.insert(flight(0, 10, Outcome::Collided)).unwrap();
+    replay.insert(episode(0, 10, Outcome::Collided)).unwrap();
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(5), 100_000, &mut batch);
     for step in 0..10 {
@@ -183,7 +198,10 @@ fn every_transition_of_a_part_is_equally_likely() {
             .filter(|&&reward| reward == step as f32 / 100.0)
             .count();
         // Five standard deviations of a binomial count of 100,000 draws at 1/10.
-        assert!(drawn.abs_diff(10_000) < 475, "step {step} was drawn {drawn} times");
+        assert!(
+            drawn.abs_diff(10_000) < 475,
+            "step {step} was drawn {drawn} times"
+        );
     }
 }
 
@@ -191,7 +209,9 @@ fn every_transition_of_a_part_is_equally_likely() {
 fn a_minibatch_is_a_function_of_content_and_seed() {
     let mut replay = frozen(&config(100, Observation::LatentVelocity));
     for number in 0..20 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
     let draw = |seed| {
         let mut batch = Minibatch::default();
@@ -208,11 +228,13 @@ fn rows_of_a_minibatch_belong_together() {
     config.learning.critic_input = CriticInput::GroundTruth;
     let mut replay = frozen(&config);
     for number in 0..20 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
     let mut batch = Minibatch::default();
     replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
-    let width = config.view().len();
+    let width = config.observation_layout().len();
     for index in 0..64 {
         let observation = &batch.observations[index * width..(index + 1) * width];
         let next = &batch.next_observations[index * width..(index + 1) * width];
@@ -220,70 +242,88 @@ fn rows_of_a_minibatch_belong_together() {
         assert_eq!(
             next[LATENT],
             at + 1.25,
-            "the next observation is one step later in the same flight"
+            "the next observation is one step later in the same episode"
         );
         assert_eq!(batch.rewards[index], at / 100.0);
-        for (states, seen) in [(&batch.true_states, observation), (&batch.next_true_states, next)] {
-            let state = &states[index * TRUE_STATE..][..TRUE_STATE];
+        for (states, seen) in [
+            (&batch.true_states, observation),
+            (&batch.next_true_states, next),
+        ] {
+            let state = &states[index * PRIVILEGED_STATE..][..PRIVILEGED_STATE];
             assert_eq!(
                 state[17..19],
                 seen[LATENT..LATENT + 2],
-                "the critic is told of the same moment"
+                "the critic sees the same moment"
             );
-            assert_eq!(state[21..], seen[LATENT + 2..], "and of the action before it");
+            assert_eq!(state[21..], seen[LATENT + 2..], "and the action before it");
         }
         assert_eq!(
             batch.actions[2 * index..2 * index + 2],
             next[LATENT + 2..],
-            "what is done now was done before then"
+            "the present action is the previous one of the next observation"
         );
         assert_eq!(batch.terminated[index] == 1.0, at % 1000.0 == 8.0);
     }
 }
 
 #[test]
-fn a_truncated_flight_is_not_terminated_anywhere() {
+fn a_truncated_episode_is_not_terminated_anywhere() {
     for (outcome, expected) in [
         (Outcome::TimedOut, 0.0),
         (Outcome::Collided, 1.0),
         (Outcome::ReachedEnd, 1.0),
     ] {
         let mut replay = frozen(&config(100, Observation::Latent));
-        replay.insert(flight(1, 6, outcome)).unwrap();
-        let terminated: Vec<_> = (0..6).map(|slot| replay.regular.row(slot).terminated).collect();
+        replay.insert(episode(1, 6, outcome)).unwrap();
+        let terminated: Vec<_> = (0..6)
+            .map(|slot| replay.regular.row(slot).terminated)
+            .collect();
         assert_eq!(terminated, [0.0, 0.0, 0.0, 0.0, 0.0, expected]);
     }
 }
 
 #[test]
-fn memory_is_bounded_and_set_aside_once() {
+fn memory_is_bounded_and_reserved_once() {
     let config = config(64, Observation::Latent);
     let mut replay = frozen(&config);
-    replay.insert(flight(0, 1, Outcome::Collided)).unwrap();
+    replay.insert(episode(0, 1, Outcome::Collided)).unwrap();
     let first_row = replay.regular.row(0).observation.as_ptr();
     for number in 1..100 {
-        replay.insert(flight(number, 9, Outcome::Collided)).unwrap();
+        replay
+            .insert(episode(number, 9, Outcome::Collided))
+            .unwrap();
     }
-    assert_eq!(replay.len(), 48, "the regular part is full, the success part empty");
+    assert_eq!(
+        replay.len(),
+        48,
+        "the regular part is full, the success part empty"
+    );
     assert_eq!(
         replay.regular.row(0).observation.as_ptr(),
         first_row,
         "no growth moved the rows"
     );
     let state = replay.state().regular;
-    assert_eq!((state.rows.len(), state.images.len()), (48 * (2 * LATENT + 4), 0));
+    assert_eq!(
+        (state.rows.len(), state.images.len()),
+        (48 * (2 * LATENT + 4), 0)
+    );
 }
 
 #[test]
 fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
     let mut config = config(64, Observation::Latent);
     config.vae.train_steps = 10;
-    config.learning.flights_per_epoch = 1;
-    config.transport.max_records_per_flight = 20;
+    config.learning.episodes_per_epoch = 1;
+    config.transport.max_records_per_episode = 20;
     let mut replay = Replay::new(&config);
-    replay.insert(with_images(flight(0, 30, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 30, Outcome::Collided)))
+        .unwrap();
     let before = replay.state();
-    let error = replay.insert(with_images(flight(1, 9, Outcome::Collided))).unwrap_err();
+    let error = replay
+        .insert(with_images(episode(1, 9, Outcome::Collided)))
+        .unwrap_err();
     assert!(
         matches!(
             error,
@@ -300,35 +340,44 @@ fn more_images_than_training_can_need_are_refused_and_nothing_is_stored() {
 }
 
 #[test]
-fn a_flight_without_images_is_refused_while_the_vae_is_trained() {
+fn an_episode_without_images_is_refused_while_the_vae_is_trained() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    let error = replay.insert(flight(7, 3, Outcome::Collided)).unwrap_err();
-    assert_eq!(error, InsertError::NoImages { flight: FlightId(7) });
+    let error = replay.insert(episode(7, 3, Outcome::Collided)).unwrap_err();
+    assert_eq!(
+        error,
+        InsertError::NoImages {
+            episode: EpisodeId(7)
+        }
+    );
     assert!(replay.is_empty());
 }
 
 #[test]
 fn images_are_dropped_when_the_vae_is_frozen_and_no_more_are_taken() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
     assert_eq!(replay.image_count(), Some(6));
     replay.freeze();
-    replay.insert(with_images(flight(1, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(1, 5, Outcome::Collided)))
+        .unwrap();
     assert_eq!(replay.image_count(), None);
     assert_eq!(replay.state().images, None);
 }
 
 #[test]
-fn the_encoder_sees_pieces_of_one_size_whatever_the_flights_lengths() {
+fn the_encoder_receives_pieces_of_one_size_whatever_the_episodes_lengths() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for (number, steps) in [(0, 2), (1, 6), (2, 1)] {
         replay
-            .insert(with_images(flight(number, steps, Outcome::Collided)))
+            .insert(with_images(episode(number, steps, Outcome::Collided)))
             .unwrap();
     }
     let mut pieces = Vec::new();
     replay
-        .renew_latents(5, |images| {
+        .recode_latents(5, |images| {
             pieces.push(images.len() / IMAGE_PIXELS);
             encode(images)
         })
@@ -339,10 +388,12 @@ fn the_encoder_sees_pieces_of_one_size_whatever_the_flights_lengths() {
 #[test]
 fn a_failed_encoder_leaves_everything_as_it_was() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
     let before = replay.state();
     let mut calls = 0;
-    let result = replay.renew_latents(4, |images| {
+    let result = replay.recode_latents(4, |images| {
         calls += 1;
         if calls == 2 {
             Err("out of memory")
@@ -355,17 +406,20 @@ fn a_failed_encoder_leaves_everything_as_it_was() {
 }
 
 #[test]
-fn sampled_images_are_those_of_the_flights_closing_ones_included() {
+fn sampled_images_are_the_episodes_own_closing_ones_included() {
     let mut replay = Replay::new(&config(64, Observation::Latent));
     for number in 0..3 {
         replay
-            .insert(with_images(flight(number, 2, Outcome::Collided)))
+            .insert(with_images(episode(number, 2, Outcome::Collided)))
             .unwrap();
     }
     let mut images = Vec::new();
     replay.sample_images(&mut Pcg64Mcg::seed_from_u64(3), 200, &mut images);
     assert_eq!(images.len(), 200 * IMAGE_PIXELS);
-    let mut drawn: Vec<_> = images.chunks_exact(IMAGE_PIXELS).map(|image| image[0]).collect();
+    let mut drawn: Vec<_> = images
+        .chunks_exact(IMAGE_PIXELS)
+        .map(|image| image[0])
+        .collect();
     drawn.sort_unstable();
     drawn.dedup();
     let mut expected: Vec<_> = (0..3)
@@ -379,8 +433,11 @@ fn sampled_images_are_those_of_the_flights_closing_ones_included() {
 fn content_of_another_shape_is_not_restored() {
     let narrow = config(64, Observation::Latent);
     let mut replay = Replay::new(&narrow);
-    replay.insert(with_images(flight(0, 5, Outcome::Collided))).unwrap();
-    let error = Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
+    replay
+        .insert(with_images(episode(0, 5, Outcome::Collided)))
+        .unwrap();
+    let error =
+        Replay::restore(&config(64, Observation::LatentVelocity), replay.state()).unwrap_err();
     assert_eq!(error.part, "regular part");
     let mut without_images = replay.state();
     without_images.images = None;
@@ -390,14 +447,21 @@ fn content_of_another_shape_is_not_restored() {
     );
     let mut too_few = replay.state();
     too_few.images = Some(Vec::new());
-    assert_eq!(Replay::restore(&narrow, too_few).unwrap_err().part, "depth images");
+    assert_eq!(
+        Replay::restore(&narrow, too_few).unwrap_err().part,
+        "depth images"
+    );
     let mut endless = replay.state();
     endless.success.inserted = u64::MAX;
     let error = Replay::restore(&narrow, endless).unwrap_err();
-    assert!(error.problem.contains("more than any run commits"), "{error}");
+    assert!(
+        error.problem.contains("more than any run commits"),
+        "{error}"
+    );
 }
 
-/// Prints what a minibatch costs: `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
+/// Prints the time of a minibatch:
+/// `cargo test --release -p skein-learner -- --ignored --nocapture minibatch_of_256`.
 #[test]
 #[ignore = "a measurement, not a claim"]
 fn time_of_a_minibatch_of_256_from_a_full_buffer() {
@@ -405,11 +469,11 @@ fn time_of_a_minibatch_of_256_from_a_full_buffer() {
     config.replay.success_share = 0.125;
     let mut replay = frozen(&config);
     for number in 0..20_000 {
-        let mut flight = flight(number, 50, Outcome::Collided);
+        let mut episode = episode(number, 50, Outcome::Collided);
         for step in 0..10 {
-            flight.level_up[step * 5] = true;
+            episode.level_up[step * 5] = true;
         }
-        replay.insert(flight).unwrap();
+        replay.insert(episode).unwrap();
     }
     assert_eq!(replay.len(), 1 << 17);
     let mut batch = Minibatch::default();

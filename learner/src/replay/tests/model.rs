@@ -1,4 +1,5 @@
-//! The buffer against a naive model of it: overwriting, sorting, freezing, storing and restoring at any point.
+//! The buffer against a naive model of it: overwriting, sorting, freezing, storing and restoring at
+//! any point.
 
 use std::collections::VecDeque;
 
@@ -8,9 +9,9 @@ use skein_protocol::transition::Outcome;
 
 use super::super::*;
 use super::{config, encode, final_code};
-use crate::flight::samples::{flight, with_images};
+use crate::episode::samples::{episode, with_images};
 
-/// A transition, owned.
+/// A transition that owns its values.
 #[derive(Debug, Clone, PartialEq)]
 struct Transition {
     observation: Vec<f32>,
@@ -23,7 +24,7 @@ struct Transition {
 /// The model: both parts as queues of owned transitions, the oldest in front.
 struct Model {
     parts: [(VecDeque<Transition>, usize); 2],
-    view: View,
+    view: ObservationLayout,
     section: ReplaySection,
 }
 
@@ -33,20 +34,24 @@ impl Model {
         let parts = [(VecDeque::new(), success), (VecDeque::new(), regular)];
         Self {
             parts,
-            view: config.view(),
+            view: config.observation_layout(),
             section: config.replay.clone(),
         }
     }
 
-    fn insert(&mut self, flight: &CommittedFlight) {
-        for step in 0..flight.steps() {
+    fn insert(&mut self, episode: &CommittedEpisode) {
+        for step in 0..episode.steps() {
             let moment = |step: usize| {
-                let mut vector = flight.observations[step].latent[..self.view.latent].to_vec();
-                if self.view.moment != Observation::Latent {
-                    vector.extend(&flight.observations[step].velocity_mps[1..]);
+                let mut vector = episode.observations[step].latent[..self.view.latent].to_vec();
+                if self.view.per_step != Observation::Latent {
+                    vector.extend(&episode.observations[step].velocity_mps[1..]);
                 }
-                if self.view.moment == Observation::LatentVelocityAction {
-                    vector.extend(if step == 0 { [0.0; 2] } else { flight.actions[step - 1] });
+                if self.view.per_step == Observation::LatentVelocityAction {
+                    vector.extend(if step == 0 {
+                        [0.0; 2]
+                    } else {
+                        episode.actions[step - 1]
+                    });
                 }
                 vector
             };
@@ -57,12 +62,12 @@ impl Model {
                 }
                 vector
             };
-            let ends = step + 1 == flight.steps() && flight.outcome != Some(Outcome::TimedOut);
+            let ends = step + 1 == episode.steps() && episode.outcome != Some(Outcome::TimedOut);
             let transition = Transition {
                 observation: observed(step),
                 next_observation: observed(step + 1),
-                action: flight.actions[step],
-                reward: flight.rewards[step],
+                action: episode.actions[step],
+                reward: episode.rewards[step],
                 terminated: if ends { 1.0 } else { 0.0 },
             };
             let ahead = match self.section.success {
@@ -70,7 +75,10 @@ impl Model {
                 SuccessRule::Approach => self.section.approach_steps,
             };
             let success = self.section.success_share > 0.0
-                && flight.level_up[step..].iter().take(ahead + 1).any(|&level_up| level_up);
+                && episode.level_up[step..]
+                    .iter()
+                    .take(ahead + 1)
+                    .any(|&level_up| level_up);
             let (part, capacity) = &mut self.parts[usize::from(!success)];
             part.push_back(transition);
             if part.len() > *capacity {
@@ -81,8 +89,11 @@ impl Model {
 
     fn set_latents(&mut self, latent: impl Fn(&[f32]) -> LatentCode) {
         for transition in self.parts.iter_mut().flat_map(|(part, _)| part) {
-            for vector in [&mut transition.observation, &mut transition.next_observation] {
-                for moment in vector.chunks_exact_mut(self.view.moment_len()) {
+            for vector in [
+                &mut transition.observation,
+                &mut transition.next_observation,
+            ] {
+                for moment in vector.chunks_exact_mut(self.view.step_len()) {
                     let made = latent(moment);
                     moment[..self.view.latent].copy_from_slice(&made[..self.view.latent]);
                 }
@@ -112,23 +123,32 @@ fn transitions(ring: &Ring) -> Vec<Transition> {
 }
 
 fn assert_same(replay: &Replay, model: &Model) {
-    assert_eq!(transitions(&replay.success), Vec::from(model.parts[0].0.clone()));
-    assert_eq!(transitions(&replay.regular), Vec::from(model.parts[1].0.clone()));
+    assert_eq!(
+        transitions(&replay.success),
+        Vec::from(model.parts[0].0.clone())
+    );
+    assert_eq!(
+        transitions(&replay.regular),
+        Vec::from(model.parts[1].0.clone())
+    );
 }
 
 prop_compose! {
-    /// Flights of 1 to 12 steps with crossings anywhere and every outcome.
-    fn flights()(
-        shapes in prop::collection::vec((prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize), 1..20)
-    ) -> Vec<CommittedFlight> {
+    /// Episodes of 1 to 12 steps with crossings anywhere and every outcome.
+    fn episodes()(
+        shapes in prop::collection::vec(
+            (prop::collection::vec(prop::bool::weighted(0.2), 1..12), 0..3_usize),
+            1..20,
+        )
+    ) -> Vec<CommittedEpisode> {
         shapes
             .into_iter()
             .enumerate()
             .map(|(number, (level_up, outcome))| {
                 let outcome = [Outcome::Collided, Outcome::ReachedEnd, Outcome::TimedOut][outcome];
-                let mut flight = flight(number as u64, level_up.len(), outcome);
-                flight.level_up = level_up;
-                flight
+                let mut episode = episode(number as u64, level_up.len(), outcome);
+                episode.level_up = level_up;
+                episode
             })
             .collect()
     }
@@ -137,10 +157,11 @@ prop_compose! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Overwriting, classification, freezing at any point, saving and restoring at any point: always what the model holds.
+    /// Overwriting, classification, freezing, saving and restoring at any point: the content is
+    /// always the model's.
     #[test]
     fn holds_what_a_naive_model_holds(
-        flights in flights(),
+        episodes in episodes(),
         capacity in 4..80_usize,
         freeze_after in 0..20_usize,
         observation in prop::sample::select(vec![
@@ -159,15 +180,19 @@ proptest! {
         config.replay.success = rule;
         config.replay.approach_steps = 3;
         let (mut replay, mut model) = (Replay::new(&config), Model::new(&config));
-        for (number, flight) in flights.iter().enumerate() {
+        for (number, episode) in episodes.iter().enumerate() {
             if number == freeze_after {
-                replay.renew_latents(chunk, encode).unwrap();
+                replay.recode_latents(chunk, encode).unwrap();
                 replay.freeze();
                 model.set_latents(|vector| final_code(vector[0] as u8));
             }
             let images_live = replay.image_count().is_some();
-            replay.insert(if images_live { with_images(flight.clone()) } else { flight.clone() }).unwrap();
-            model.insert(flight);
+            let flown = match images_live {
+                true => with_images(episode.clone()),
+                false => episode.clone(),
+            };
+            replay.insert(flown).unwrap();
+            model.insert(episode);
             assert_same(&replay, &model);
             let restored = Replay::restore(&config, replay.state()).unwrap();
             prop_assert_eq!(restored.state(), replay.state());

@@ -1,39 +1,42 @@
-//! Actions drawn from the policy, their log-probability, and the way back through both.
+//! Actions drawn from the policy, their log-probability, and the gradients through both.
 //!
-//! The same functions as those of [`crate::networks::Policy`], element by element, and their derivatives.
+//! Element by element, these are the functions of [`crate::networks::Policy`] and their
+//! derivatives.
 
 use std::f32::consts::LN_2;
 
 use skein_kernels::{Isa, exp};
 use skein_protocol::{ACTION, LOG_STD};
 
-/// Numbers of the policy's output in a row: means, and logarithms of standard deviations.
+/// Policy outputs per row: the means, then the logarithms of the standard deviations.
 const OUTPUTS: usize = 2 * ACTION;
 /// ½ ln 2π.
 const HALF_LN_TAU: f32 = 0.918_938_5;
 
-/// Actions drawn for rows of observations. All but `log_prob` are `[rows, 2]`.
+/// Actions drawn for rows of observations. All fields but `log_prob` are `[rows, 2]`.
 #[derive(Debug, Default)]
 pub(super) struct Sample {
-    /// Standard normal noise: to be filled before anything is drawn.
+    /// Standard normal noise; the caller fills it before [`Sample::draw`].
     pub(super) noise: Vec<f32>,
+    /// Mean of the normal distribution before tanh.
     mean: Vec<f32>,
-    /// As the network gave it, unbounded.
+    /// Logarithm of its standard deviation as the network gave it, before bounding.
     log_std: Vec<f32>,
     /// std · noise.
     deviation: Vec<f32>,
-    /// Inside (-1, 1).
+    /// Actions, tanh(mean + std · noise), inside (-1, 1).
     pub(super) actions: Vec<f32>,
-    /// Derivative of tanh.
+    /// Derivative of tanh there.
     slope: Vec<f32>,
+    /// Summand of log π that belongs to this element.
     element_log_prob: Vec<f32>,
     /// log π(action | observation) in nats, `[rows]`.
     pub(super) log_prob: Vec<f32>,
 }
 
 impl Sample {
-    /// Places for so many rows.
-    pub(super) fn places(rows: usize) -> Self {
+    /// Allocates buffers for `rows` rows.
+    pub(super) fn allocate(rows: usize) -> Self {
         let element = || vec![0.0; rows * ACTION];
         Self {
             noise: element(),
@@ -47,7 +50,8 @@ impl Sample {
         }
     }
 
-    /// a = tanh(x), x = mean + std · noise, and log π(a) (arXiv:1812.05905, eq. 26). `output`: the policy network's, `[rows, 4]`.
+    /// Draws a = tanh(x), x = mean + std · noise, and computes log π(a) (arXiv:1812.05905, eq. 26).
+    /// `output`: the policy network's, `[rows, 4]`.
     pub(super) fn draw(&mut self, isa: Isa, output: &[f32]) {
         let rows = output.chunks_exact(OUTPUTS);
         let own = self
@@ -69,15 +73,22 @@ impl Sample {
             ..
         } = self;
         let given = noise.iter().zip(mean).zip(log_std);
-        let made = deviation.iter_mut().zip(actions).zip(slope).zip(element_log_prob);
+        let made = deviation
+            .iter_mut()
+            .zip(actions)
+            .zip(slope)
+            .zip(element_log_prob);
         isa.vectorised(
             #[inline(always)]
             || {
-                for (((noise, mean), log_std), (((deviation, action), slope), log_prob)) in given.zip(made) {
+                for (((noise, mean), log_std), (((deviation, action), slope), log_prob)) in
+                    given.zip(made)
+                {
                     let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
                     *deviation = exp(log_std) * noise;
                     let x = *mean + *deviation;
-                    // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 + e)²: exact where tanh saturates.
+                    // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 +
+                    // e)². Both stay exact where tanh saturates.
                     let e = exp(-2.0 * x.abs());
                     *action = ((1.0 - e) / (1.0 + e)).copysign(x);
                     *slope = 4.0 * e / ((1.0 + e) * (1.0 + e));
@@ -93,11 +104,19 @@ impl Sample {
         }
     }
 
-    /// What flows back to the policy network's output from the rows behind the first `skipped`, `[rows, 4]`, when `log_prob_gradient` flows back to each log π
-    /// and `action_gradient`, `[rows, 2]`, to the actions.
+    /// Computes the gradient with respect to the policy network's output, `[rows, 4]`, for the rows
+    /// after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to each
+    /// log π, and `action_gradient`, `[rows, 2]`, with respect to the actions.
     ///
-    /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1, ∂x/∂log_std = std · noise; ∂log π/∂log_std = -1 besides. Nothing flows through a bound of log_std.
-    pub(super) fn backward(&self, skipped: usize, log_prob_gradient: f32, action_gradient: &[f32], into: &mut [f32]) {
+    /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1; ∂x/∂log_std = std · noise; log_std
+    /// also enters log π directly, ∂log π/∂log_std = -1. No gradient passes a bound of log_std.
+    pub(super) fn backward(
+        &self,
+        skipped: usize,
+        log_prob_gradient: f32,
+        action_gradient: &[f32],
+        into: &mut [f32],
+    ) {
         for (row, into) in into.chunks_exact_mut(OUTPUTS).enumerate() {
             for dimension in 0..ACTION {
                 let at = (skipped + row) * ACTION + dimension;
@@ -115,13 +134,22 @@ impl Sample {
     }
 }
 
-/// ln(1 + e) for e in [0, 1], within 1e-7: 2 artanh s with s = e / (2 + e) ≤ ⅓, by its series up to s¹⁵ (remainder below 1e-9).
+/// ln(1 + e) for e in [0, 1], within 1e-7. It is 2 artanh s with s = e / (2 + e) ≤ ⅓, by the series
+/// up to s¹⁵ (remainder below 1e-9).
 #[inline(always)]
 fn ln_1p(e: f32) -> f32 {
     let s = e / (2.0 + e);
     let square = s * s;
     let mut sum = 1.0 / 15.0;
-    for factor in [1.0 / 13.0, 1.0 / 11.0, 1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0] {
+    for factor in [
+        1.0 / 13.0,
+        1.0 / 11.0,
+        1.0 / 9.0,
+        1.0 / 7.0,
+        1.0 / 5.0,
+        1.0 / 3.0,
+        1.0,
+    ] {
         sum = square.mul_add(sum, factor);
     }
     2.0 * s * sum

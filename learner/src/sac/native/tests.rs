@@ -1,4 +1,4 @@
-//! Against the reference, number by number; and that neither threads nor instructions change a bit.
+//! Native against libtorch, number by number; neither threads nor instructions change a bit.
 
 use tch::Device;
 
@@ -7,7 +7,7 @@ use super::super::samples::Transitions;
 use super::*;
 use crate::state::{NamedTensor, TensorValues};
 
-/// Numbers in an observation.
+/// Widths of observation to test.
 const OBSERVATIONS: [usize; 3] = [32, 34, 36];
 
 fn section(hidden_width: usize) -> SacSection {
@@ -17,7 +17,7 @@ fn section(hidden_width: usize) -> SacSection {
     }
 }
 
-/// Both engines before their first update.
+/// Returns both engines before their first update.
 fn both(section: &SacSection, inputs: Inputs, seed: u64) -> (NativeSac, TorchSac) {
     crate::device::use_threads(1);
     (
@@ -40,16 +40,26 @@ fn numbers(state: &mut impl Stateful) -> Vec<(String, Vec<f64>)> {
     state.into_iter().map(wide).collect()
 }
 
-/// Largest difference between two vectors, as a share of the largest number in them.
+/// Largest difference between two vectors, relative to the largest number in `expected`.
 fn distance(found: &[f64], expected: &[f64]) -> f64 {
     assert_eq!(found.len(), expected.len());
     let largest = |numbers: &mut dyn Iterator<Item = f64>| numbers.fold(0.0, f64::max);
-    let apart = largest(&mut found.iter().zip(expected).map(|(left, right)| (left - right).abs()));
+    let apart = largest(
+        &mut found
+            .iter()
+            .zip(expected)
+            .map(|(left, right)| (left - right).abs()),
+    );
     let size = largest(&mut expected.iter().map(|value| value.abs()));
     if apart == 0.0 { 0.0 } else { apart / size }
 }
 
-fn assert_metrics_are_close(found: &[(Scalar, f32)], expected: &[(Scalar, f32)], tolerance: f32, context: &str) {
+fn assert_metrics_are_close(
+    found: &[(Scalar, f32)],
+    expected: &[(Scalar, f32)],
+    tolerance: f32,
+    context: &str,
+) {
     for ((scalar, found), (same, expected)) in found.iter().zip(expected) {
         assert_eq!(scalar, same);
         let apart = (found - expected).abs();
@@ -60,17 +70,28 @@ fn assert_metrics_are_close(found: &[(Scalar, f32)], expected: &[(Scalar, f32)],
     }
 }
 
-/// One update of both from the same state; what Adam then remembers is a tenth of the gradient.
-fn assert_one_update_is_equal(native: &mut NativeSac, torch: &mut TorchSac, transitions: &Transitions, context: &str) {
+/// Updates both engines once from the same state. Adam's first moment is then a tenth of the
+/// gradient.
+fn assert_one_update_is_equal(
+    native: &mut NativeSac,
+    torch: &mut TorchSac,
+    transitions: &Transitions,
+    context: &str,
+) {
     let noise = || Noise::new(9);
     let columns = transitions.columns();
-    let found = native.update(&mut Team::new(1), columns, &mut noise()).unwrap();
-    let expected = torch.update(&mut Team::new(1), columns, &mut noise()).unwrap();
+    let found = native
+        .update(&mut Team::new(1), columns, &mut noise())
+        .unwrap();
+    let expected = torch
+        .update(&mut Team::new(1), columns, &mut noise())
+        .unwrap();
     assert_metrics_are_close(&found, &expected, 2e-5, context);
     for ((name, found), (_, expected)) in numbers(native).iter().zip(&numbers(torch)) {
         let context = format!("{context}: {name}");
         if name.ends_with("parameters") || name.ends_with("log_temperature") {
-            // Where a gradient is nearly nothing, so is what is known of its sign, which is all that the first step looks at.
+            // A gradient near zero may differ in sign between the engines, and Adam's first step
+            // depends on the sign alone.
             let apart = found
                 .iter()
                 .zip(expected)
@@ -91,13 +112,25 @@ fn assert_one_update_is_equal(native: &mut NativeSac, torch: &mut TorchSac, tran
 
 #[test]
 fn gradients_and_one_update_are_the_references() {
-    // Whether the critic is told something else, and how much.
-    for (number, (observation, told)) in OBSERVATIONS.into_iter().zip([None, Some(5), Some(50)]).enumerate() {
+    // `critic_width`: width of the critic's own input, if it has one.
+    for (number, (observation, critic_width)) in OBSERVATIONS
+        .into_iter()
+        .zip([None, Some(5), Some(50)])
+        .enumerate()
+    {
         let inputs = Inputs {
-            critic: told.unwrap_or(observation),
+            critic: critic_width.unwrap_or(observation),
             ..Inputs::same(observation)
         };
-        for (width, rows) in [(8, 1), (8, 33), (31, 7), (31, 8), (64, 50), (256, 256), (100, 201)] {
+        for (width, rows) in [
+            (8, 1),
+            (8, 33),
+            (31, 7),
+            (31, 8),
+            (64, 50),
+            (256, 256),
+            (100, 201),
+        ] {
             let seed = (number + rows) as u64;
             let section = SacSection {
                 critic_networks: 1 + rows % 2,
@@ -106,8 +139,8 @@ fn gradients_and_one_update_are_the_references() {
             let (mut native, mut torch) = both(&section, inputs, seed);
             let mut noise = Noise::new(seed);
             let mut transitions = Transitions::random(observation, rows, &mut noise);
-            if let Some(told) = told {
-                transitions = transitions.telling(told, &mut noise);
+            if let Some(critic_width) = critic_width {
+                transitions = transitions.with_critic_states(critic_width, &mut noise);
             }
             let context = format!(
                 "{observation} seen, width {width}, {rows} rows, {} networks",
@@ -130,7 +163,8 @@ fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded(
     let TensorValues::F32(values) = &mut policy.values else {
         unreachable!("parameters are f32")
     };
-    // The biases of the last layer, which end the vector: one mean far out, one log deviation above its bound and one below.
+    // The biases of the last layer, which end the vector: one mean far out, one log deviation above
+    // its bound and one below.
     let len = values.len();
     values[len - 4..].copy_from_slice(&[12.0, -0.5, 2.5, -21.0]);
     native.load_named(&stored).unwrap();
@@ -149,17 +183,31 @@ fn a_hundred_updates_stay_close_to_the_references() {
         let before = numbers(&mut native);
         for number in 1..=100 {
             let transitions = Transitions::random(observation, 64, &mut data);
-            let found = native.update(&mut team, transitions.columns(), &mut noise).unwrap();
-            let expected = torch.update(&mut team, transitions.columns(), &mut same_noise).unwrap();
-            assert_metrics_are_close(&found, &expected, 1e-3, &format!("seed {seed}, update {number}"));
+            let found = native
+                .update(&mut team, transitions.columns(), &mut noise)
+                .unwrap();
+            let expected = torch
+                .update(&mut team, transitions.columns(), &mut same_noise)
+                .unwrap();
+            assert_metrics_are_close(
+                &found,
+                &expected,
+                1e-3,
+                &format!("seed {seed}, update {number}"),
+            );
         }
         let after = numbers(&mut native);
-        for (((name, found), (_, expected)), (_, before)) in after.iter().zip(&numbers(&mut torch)).zip(&before) {
+        for (((name, found), (_, expected)), (_, before)) in
+            after.iter().zip(&numbers(&mut torch)).zip(&before)
+        {
             if !name.ends_with("parameters") {
                 continue;
             }
             let apart = |left: &[f64], right: &[f64]| {
-                let squares = left.iter().zip(right).map(|(left, right)| (left - right).powi(2));
+                let squares = left
+                    .iter()
+                    .zip(right)
+                    .map(|(left, right)| (left - right).powi(2));
                 squares.sum::<f64>().sqrt()
             };
             let (off, moved) = (apart(found, expected), apart(found, before));
@@ -177,11 +225,13 @@ fn neither_threads_nor_instructions_change_a_bit() {
     for (width, rows) in [(40, 131), (16, 5)] {
         let run = |isa: Isa, members: usize| {
             let mut sac = NativeSac::new(&section(width), Inputs::same(observation), 1, isa);
-            let (mut data, mut noise, mut team) = (Noise::new(1), Noise::new(2), Team::new(members));
+            let (mut data, mut noise, mut team) =
+                (Noise::new(1), Noise::new(2), Team::new(members));
             let metrics: Vec<_> = (0..5)
                 .map(|_| {
                     let transitions = Transitions::random(observation, rows, &mut data);
-                    sac.update(&mut team, transitions.columns(), &mut noise).unwrap()
+                    sac.update(&mut team, transitions.columns(), &mut noise)
+                        .unwrap()
                 })
                 .collect();
             let mode = sac.mode(&Transitions::random(observation, 3, &mut data).observations);
@@ -190,7 +240,11 @@ fn neither_threads_nor_instructions_change_a_bit() {
         let expected = run(Isa::Portable, 1);
         for isa in Isa::ALL.into_iter().filter(|isa| isa.is_available()) {
             for members in 1..=4 {
-                assert_eq!(run(isa, members), expected, "{isa}, {members} members, {rows} rows");
+                assert_eq!(
+                    run(isa, members),
+                    expected,
+                    "{isa}, {members} members, {rows} rows"
+                );
             }
         }
     }
@@ -203,10 +257,14 @@ fn batches_of_changing_size_are_what_they_are_alone() {
     let large = Transitions::random(observation, 50, &mut Noise::new(1));
     let little = Transitions::random(observation, 3, &mut Noise::new(2));
     let mut sac = NativeSac::new(&section, Inputs::same(observation), 1, Isa::best());
-    sac.update(&mut team, large.columns(), &mut Noise::new(3)).unwrap();
+    sac.update(&mut team, large.columns(), &mut Noise::new(3))
+        .unwrap();
     let mut fresh = NativeSac::new(&section, Inputs::same(observation), 2, Isa::best());
     fresh.load_named(&sac.named_tensors()).unwrap();
-    let run = |sac: &mut NativeSac, team: &mut Team| sac.update(team, little.columns(), &mut Noise::new(4)).unwrap();
+    let run = |sac: &mut NativeSac, team: &mut Team| {
+        sac.update(team, little.columns(), &mut Noise::new(4))
+            .unwrap()
+    };
     assert_eq!(run(&mut sac, &mut team), run(&mut fresh, &mut team));
     assert_eq!(sac.named_tensors(), fresh.named_tensors());
 }

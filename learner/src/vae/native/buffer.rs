@@ -4,35 +4,36 @@ use std::ops::{Deref, DerefMut};
 
 use bytemuck::{Pod, Zeroable};
 
-/// Numbers in a cache line.
+/// f32 numbers per cache line.
 const LINE: usize = 16;
 
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C, align(64))]
-struct Line([f32; LINE]);
+struct CacheLine([f32; LINE]);
 
-/// Numbers from the beginning of a cache line, kept from use to use. A vector register that is loaded across two lines takes twice the time.
+/// A buffer of numbers, aligned to a cache line and reused. Loading a vector register across two
+/// lines takes twice the time.
 #[derive(Debug, Default)]
 pub(super) struct Buffer {
-    lines: Vec<Line>,
+    lines: Vec<CacheLine>,
     len: usize,
 }
 
 impl Buffer {
-    /// So many noughts.
+    /// Allocates `len` zeros.
     pub(super) fn zeroed(len: usize) -> Self {
         Self {
-            // The system's own noughts: memory that is never written is never given.
+            // The system's own zeroed pages: memory that is never written is never allocated.
             lines: bytemuck::zeroed_vec(len.div_ceil(LINE)),
             len,
         }
     }
 
-    /// Makes room for `len` numbers, whatever they are. Memory is not given back.
+    /// Makes room for `len` numbers of any value. Memory is not released.
     pub(super) fn resize(&mut self, len: usize) {
         let lines = len.div_ceil(LINE);
         if self.lines.len() < lines {
-            self.lines.resize(lines, Line::zeroed());
+            self.lines.resize(lines, CacheLine::zeroed());
         }
         self.len = len;
     }
@@ -57,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_buffer_begins_where_a_cache_line_does_and_has_the_length_asked_for() {
+    fn a_buffer_starts_at_a_cache_line_and_has_the_requested_length() {
         let mut buffer = Buffer::zeroed(5);
         for len in [5, 100, 3, 0] {
             buffer.resize(len);

@@ -1,11 +1,12 @@
-//! What is done number by number between the products.
+//! Elementwise operations between the matrix products.
 
 use skein_kernels::{Isa, sigmoid};
 
-/// Numbers summed side by side; sums of sums follow in order. So the result does not depend on how wide a register is.
+/// Width of partial sums, which are then added in order. So the result does not depend on the
+/// register width.
 pub(super) const LANES: usize = 16;
 
-/// Gives every pixel of `image`, `[pixels, channels]`, the `bias`, `[channels]`.
+/// Sets every pixel of `image`, `[pixels, channels]`, to `bias`, `[channels]`.
 pub(super) fn fill(image: &mut [f32], bias: &[f32]) {
     if let [bias] = bias {
         return image.fill(*bias);
@@ -15,7 +16,7 @@ pub(super) fn fill(image: &mut [f32], bias: &[f32]) {
     }
 }
 
-/// Zero for what is below zero. Not a number stays what it is.
+/// Applies ReLU in place. NaN stays NaN.
 pub(super) fn rectify(isa: Isa, values: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -27,7 +28,7 @@ pub(super) fn rectify(isa: Isa, values: &mut [f32]) {
     );
 }
 
-/// Zero where `by` is not above zero: the gradient through a ReLU whose output `by` is.
+/// Sets values to zero where `by` is not positive: the gradient through a ReLU with output `by`.
 pub(super) fn gate(isa: Isa, values: &mut [f32], by: &[f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -39,7 +40,7 @@ pub(super) fn gate(isa: Isa, values: &mut [f32], by: &[f32]) {
     );
 }
 
-/// Adds up the rows of `[rows, sums.len()]`, in order.
+/// Sums the rows of `[rows, sums.len()]`, in order.
 pub(super) fn column_sums(isa: Isa, rows: &[f32], sums: &mut [f32]) {
     let columns = sums.len();
     if columns < LANES {
@@ -64,7 +65,8 @@ pub(super) fn column_sums(isa: Isa, rows: &[f32], sums: &mut [f32]) {
             #[inline(always)]
             || {
                 for row in rows.chunks_exact(columns) {
-                    let values: &[f32; LANES] = row[block * LANES..][..LANES].try_into().expect("so long");
+                    let values: &[f32; LANES] =
+                        row[block * LANES..][..LANES].try_into().expect("so long");
                     for (sum, value) in lanes.iter_mut().zip(values) {
                         *sum += value;
                     }
@@ -100,7 +102,7 @@ pub(super) fn squares(isa: Isa, values: &[f32]) -> f64 {
     total
 }
 
-/// Depth as the networks see it, in [0, 1].
+/// Converts depth bytes to pixels in [0, 1].
 pub(super) fn scale(isa: Isa, bytes: &[u8], pixels: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -112,7 +114,7 @@ pub(super) fn scale(isa: Isa, bytes: &[u8], pixels: &mut [f32]) {
     );
 }
 
-/// The sigmoid of each number.
+/// Applies the sigmoid in place.
 pub(super) fn sigmoids(isa: Isa, values: &mut [f32]) {
     isa.vectorised(
         #[inline(always)]
@@ -124,14 +126,22 @@ pub(super) fn sigmoids(isa: Isa, values: &mut [f32]) {
     );
 }
 
-/// Replaces the numbers before the last sigmoid by `weight` times half the squared error's gradient with respect to them. Returns the sum of squared
-/// errors between sigmoid and `pixels`.
-pub(super) fn reconstruction_error(isa: Isa, values: &mut [f32], pixels: &[f32], weight: f32) -> f64 {
+/// Replaces the inputs of the last sigmoid by `weight` times the gradient of half the squared error
+/// in them. Returns the sum of squared errors between sigmoid and `pixels`.
+pub(super) fn reconstruction_error(
+    isa: Isa,
+    values: &mut [f32],
+    pixels: &[f32],
+    weight: f32,
+) -> f64 {
     let mut lanes = [0.0_f32; LANES];
     isa.vectorised(
         #[inline(always)]
         || {
-            for (values, pixels) in values.chunks_exact_mut(LANES).zip(pixels.chunks_exact(LANES)) {
+            for (values, pixels) in values
+                .chunks_exact_mut(LANES)
+                .zip(pixels.chunks_exact(LANES))
+            {
                 for ((value, pixel), sum) in values.iter_mut().zip(pixels).zip(&mut lanes) {
                     let seen = sigmoid(*value);
                     let error = seen - pixel;
@@ -162,7 +172,9 @@ mod tests {
 
     #[test]
     fn squares_are_summed_to_the_last_number() {
-        let values: Vec<f32> = (0..(1 << 14) + 37).map(|number| (number % 7) as f32).collect();
+        let values: Vec<f32> = (0..(1 << 14) + 37)
+            .map(|number| (number % 7) as f32)
+            .collect();
         let expected: f32 = values.iter().map(|value| value * value).sum();
         assert_eq!(squares(Isa::best(), &values), f64::from(expected));
     }
@@ -170,7 +182,8 @@ mod tests {
     #[test]
     fn the_error_and_its_gradient_match_differences() {
         let (before, pixels) = ([0.3_f32; LANES], [0.9_f32; LANES]);
-        let error = |before: f32| LANES as f64 * (1.0 / (1.0 + (-f64::from(before)).exp()) - 0.9).powi(2);
+        let error =
+            |before: f32| LANES as f64 * (1.0 / (1.0 + (-f64::from(before)).exp()) - 0.9).powi(2);
         let mut values = before;
         let found = reconstruction_error(Isa::best(), &mut values, &pixels, 2.0);
         assert!((found - error(0.3)).abs() < 1e-6);

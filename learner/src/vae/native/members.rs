@@ -1,4 +1,4 @@
-//! How images are shared among the members of a team.
+//! Distribution of images over the members of a team.
 
 use skein_kernels::{Isa, Team};
 
@@ -6,17 +6,17 @@ use super::buffer::Buffer;
 use super::stopwatch::Stopwatch;
 use super::unfold::UnfoldScratch;
 
-/// Working memory of a member.
+/// Working memory of one team member.
 #[derive(Debug)]
-pub(super) struct Member {
+pub(super) struct MemberScratch {
     pub(super) columns: Vec<f32>,
     pub(super) unfold: UnfoldScratch,
-    /// Images of the encoder, when they need not be kept.
+    /// Encoder outputs of one image, for encoding without a batch.
     pub(super) images: [Buffer; 5],
     pub(super) watch: Stopwatch,
 }
 
-impl Member {
+impl MemberScratch {
     pub(super) fn new(isa: Isa) -> Self {
         Self {
             columns: Vec::new(),
@@ -27,12 +27,13 @@ impl Member {
     }
 }
 
-/// Lets each member do its share of `items`, in order: `work` is given an item's number and the item.
+/// Splits `items` among the members, in order, and calls `work` with each item's index and the
+/// item.
 pub(super) fn share<T: Send>(
     team: &mut Team,
-    members: &mut [Member],
+    members: &mut [MemberScratch],
     items: &mut [T],
-    work: impl Fn(usize, &mut T, &mut Member) + Sync,
+    work: impl Fn(usize, &mut T, &mut MemberScratch) + Sync,
 ) {
     let (size, count) = (members.len(), items.len());
     let (mut rest, mut first) = (items, 0);
@@ -53,15 +54,19 @@ pub(super) fn share<T: Send>(
     });
 }
 
-/// The parts of each buffer that belong to each of `count` images.
-pub(super) fn by_image<const N: usize>(buffers: [&mut [f32]; N], count: usize) -> Vec<[&mut [f32]; N]> {
+/// Splits every buffer into the parts that belong to each of `count` images.
+pub(super) fn by_image<const N: usize>(
+    buffers: [&mut [f32]; N],
+    count: usize,
+) -> Vec<[&mut [f32]; N]> {
     let mut parts = buffers.map(|buffer| buffer.chunks_exact_mut(buffer.len() / count));
     (0..count)
         .map(|_| std::array::from_fn(|index| parts[index].next().expect("a part for each image")))
         .collect()
 }
 
-/// `rows`, each `len` long, in a part for each member with the number of its first row; fewer when there are fewer rows.
+/// Splits `rows`, each `len` long, into one part per member, with the index of its first row. With
+/// too few rows, there are fewer parts.
 pub(super) fn portions(rows: &mut [f32], len: usize, members: usize) -> Vec<(usize, &mut [f32])> {
     let each = (rows.len() / len).div_ceil(members).max(1);
     let portions = rows.chunks_mut(each * len).enumerate();

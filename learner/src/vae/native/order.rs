@@ -1,42 +1,50 @@
-//! The order in which the native engine keeps its parameters, and the way from PyTorch's order and back.
+//! The native engine's order of parameters, and its conversion from and to PyTorch's.
 //!
-//! Images lie channels-last, so weights do: `[rows' channels, kernel row, kernel column, image's channels]` for both kinds of convolution, where the rows are
-//! a convolution's output and a transposed one's input. Initial values are drawn, and snapshots published, in PyTorch's order, which is the contract with actors.
+//! Images are channels-last, hence weights too:
+//! `[rows' channels, kernel row, kernel column, image's channels]` for both kinds of convolution.
+//! Rows are the output of a convolution and the input of a transposed one. Initial values are
+//! drawn, and snapshots published, in PyTorch's order, the contract with actors.
 
 use std::ops::Range;
 
 use crate::networks::Layout;
 
-/// Where a layer's two tensors lie in the vector.
+/// Ranges of a layer's two tensors in the parameter vector.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Affine {
+pub(super) struct LayerRanges {
     pub(super) weight: Range<usize>,
     pub(super) bias: Range<usize>,
 }
 
-/// One of PyTorch's tensors, as four dimensions, and which of them is the outermost, the second, … here.
+/// A tensor of PyTorch's as four dimensions, with the permutation that leads to the native order.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Entry {
+struct OrderedTensor {
+    /// Shape in PyTorch's order.
     name: String,
+    /// Dimensions of `shape` from the outermost to the innermost in native order.
     shape: [usize; 4],
+    /// Index of the first element in the native vector.
     axes: [usize; 4],
     start: usize,
 }
 
 /// The order of the parameters.
 #[derive(Debug, Clone)]
-pub(super) struct Order {
-    /// In PyTorch's order.
-    entries: Vec<Entry>,
+pub(super) struct ParameterOrder {
+    /// Tensors, in PyTorch's order.
+    entries: Vec<OrderedTensor>,
 }
 
-/// Dimensions of a tensor of this name and shape, and their order here.
+/// Returns the four dimensions of a tensor of this name and shape, and their native order.
 fn arranged(name: &str, shape: &[usize]) -> ([usize; 4], [usize; 4]) {
     const AS_IT_IS: [usize; 4] = [0, 1, 2, 3];
     const CHANNELS_LAST: [usize; 4] = [0, 2, 3, 1];
     match (name, shape) {
-        // Each kernel row makes an image row of its own, for the input has one row only; so each is a matrix of its own.
-        ("decoder.conv1.weight", &[inputs, outputs, height, width]) => ([inputs, outputs, height, width], [2, 0, 3, 1]),
+        // The input has a single row, so each kernel row makes its own image row; therefore each is
+        // a separate matrix.
+        ("decoder.conv1.weight", &[inputs, outputs, height, width]) => {
+            ([inputs, outputs, height, width], [2, 0, 3, 1])
+        }
         (_, &[rows, channels, height, width]) => ([rows, channels, height, width], CHANNELS_LAST),
         ("encoder.mean.weight" | "encoder.log_variance.weight", &[outputs, features]) => (
             [outputs, FEATURE_CHANNELS, features / FEATURE_CHANNELS, 1],
@@ -46,28 +54,31 @@ fn arranged(name: &str, shape: &[usize]) -> ([usize; 4], [usize; 4]) {
             [UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, inputs],
             [1, 0, 2, 3],
         ),
-        ("decoder.linear.bias", &[features]) => ([UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, 1], [1, 0, 2, 3]),
+        ("decoder.linear.bias", &[features]) => (
+            [UNFOLDED_CHANNELS, features / UNFOLDED_CHANNELS, 1, 1],
+            [1, 0, 2, 3],
+        ),
         (_, &[len]) => ([len, 1, 1, 1], AS_IT_IS),
         _ => unreachable!("{name} has shape {shape:?}, which no layer of the VAE has"),
     }
 }
 
-/// Channels of the encoder's last image.
+/// Channels of the encoder's last feature map.
 const FEATURE_CHANNELS: usize = 256;
-/// Channels of the decoder's first image.
+/// Channels of the decoder's first feature map.
 const UNFOLDED_CHANNELS: usize = 1024;
 
-impl Order {
-    /// Of the tensors of `layout`, encoder and decoder.
+impl ParameterOrder {
+    /// Returns the order for the tensors of `layout`, encoder and decoder.
     pub(super) fn of(layout: &Layout) -> Self {
-        let mut entries: Vec<Entry> = layout
+        let mut entries: Vec<OrderedTensor> = layout
             .tensors()
             .iter()
             .map(|tensor| {
                 let shape: Vec<usize> = tensor.shape.iter().map(|&size| size as usize).collect();
                 let (shape, axes) = arranged(&tensor.name, &shape);
                 let name = tensor.name.clone();
-                Entry {
+                OrderedTensor {
                     name,
                     shape,
                     axes,
@@ -75,10 +86,13 @@ impl Order {
                 }
             })
             .collect();
-        // The two heads are one layer here: their weights lie side by side, and then their biases.
+        // Both heads are one layer here: their weights lie side by side, followed by their biases.
         let mut places: Vec<usize> = (0..entries.len()).collect();
         let place = |name: &str| entries.iter().position(|entry| entry.name == name);
-        if let (Some(bias), Some(weight)) = (place("encoder.mean.bias"), place("encoder.log_variance.weight")) {
+        if let (Some(bias), Some(weight)) = (
+            place("encoder.mean.bias"),
+            place("encoder.log_variance.weight"),
+        ) {
             places.swap(bias, weight);
         }
         let mut start = 0;
@@ -89,35 +103,35 @@ impl Order {
         Self { entries }
     }
 
-    /// Where the layer's tensors lie.
+    /// Ranges of the layer's tensors.
     ///
     /// # Panics
     /// When there is no such layer.
-    pub(super) fn layer(&self, name: &str) -> Affine {
-        Affine {
+    pub(super) fn layer(&self, name: &str) -> LayerRanges {
+        LayerRanges {
             weight: self.tensor(&format!("{name}.weight")),
             bias: self.tensor(&format!("{name}.bias")),
         }
     }
 
-    /// Where a tensor lies.
+    /// Range of a tensor.
     ///
     /// # Panics
-    /// When there is none of this name.
+    /// When there is no tensor of this name.
     pub(super) fn tensor(&self, name: &str) -> Range<usize> {
         let found = self.entries.iter().find(|entry| entry.name == name);
         let entry = found.expect("the layout describes every layer of the VAE");
         entry.start..entry.start + entry.len()
     }
 
-    /// From PyTorch's order.
+    /// Converts a vector from PyTorch's order.
     pub(super) fn arrange_from_pytorch(&self, values: &[f32]) -> Vec<f32> {
         let mut arranged = vec![0.0; values.len()];
         self.walk(|here, there| arranged[here] = values[there]);
         arranged
     }
 
-    /// Writes the beginning of PyTorch's order, as many tensors as fit.
+    /// Converts a vector to PyTorch's order; writes as many leading elements as fit.
     pub(super) fn to_pytorch(&self, values: &[f32], into: &mut [f32]) {
         self.walk(|here, there| {
             if let Some(into) = into.get_mut(there) {
@@ -126,11 +140,12 @@ impl Order {
         });
     }
 
-    /// Calls `pair` with the place of every number, here and in PyTorch's order.
+    /// Calls `pair` with the native and the PyTorch index of every number.
     fn walk(&self, mut pair: impl FnMut(usize, usize)) {
         let mut first = 0;
         for entry in &self.entries {
-            let strides = [3, 2, 1, 0].map(|axis: usize| entry.shape[axis + 1..].iter().product::<usize>());
+            let strides =
+                [3, 2, 1, 0].map(|axis: usize| entry.shape[axis + 1..].iter().product::<usize>());
             let [d, c, b, a] = strides;
             let strides = entry.axes.map(|axis| [a, b, c, d][axis]);
             let sizes = entry.axes.map(|axis| entry.shape[axis]);
@@ -151,7 +166,7 @@ impl Order {
     }
 }
 
-impl Entry {
+impl OrderedTensor {
     fn len(&self) -> usize {
         self.shape.iter().product()
     }
@@ -164,17 +179,17 @@ mod tests {
     use super::*;
     use crate::networks::{Decoder, Encoder};
 
-    fn order(latent: usize) -> (Order, usize) {
+    fn order(latent: usize) -> (ParameterOrder, usize) {
         let mut layout = Layout::default();
         let _ = (
             Encoder::describe(&mut layout, latent),
             Decoder::describe(&mut layout, latent, DecoderName::Plain),
         );
-        (Order::of(&layout), layout.len())
+        (ParameterOrder::of(&layout), layout.len())
     }
 
     #[test]
-    fn every_number_has_one_place_and_comes_back_to_its_own() {
+    fn every_number_has_one_place_and_returns_to_its_own() {
         let (order, len) = order(8);
         // Exact in f32 up to 2^24.
         let numbers: Vec<f32> = (0..len).map(|number| number as f32).collect();
@@ -194,7 +209,7 @@ mod tests {
             let entries = order.entries.iter();
             entries
                 .take_while(|entry| entry.name != name)
-                .map(Entry::len)
+                .map(OrderedTensor::len)
                 .sum::<usize>()
         };
         // encoder.conv2 [64, 32, 4, 4]: output 5, input 7, kernel row 1, kernel column 2.
@@ -212,7 +227,8 @@ mod tests {
         let there = first_of(name) + (9 * 3 + 2) * 32 + 11;
         let here = order.tensor(name).start + (2 * 1024 + 9) * 32 + 11;
         assert_eq!(arranged[here], there as f32);
-        // Heads [32, 3072]: output 3, channel 200 of 256, pixel 10 of 12; the second one behind the first.
+        // Heads [32, 3072]: output 3, channel 200 of 256, pixel 10 of 12; the second head follows
+        // the first.
         let name = "encoder.log_variance.weight";
         let there = first_of(name) + 3 * 3072 + 200 * 12 + 10;
         let here = order.tensor("encoder.mean.weight").start + (32 + 3) * 3072 + 10 * 256 + 200;

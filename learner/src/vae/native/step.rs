@@ -1,85 +1,114 @@
 //! Loss and gradient of a minibatch, pass by pass.
 //!
-//! Whatever concerns one image alone is done image by image, so that what one layer leaves is in the caches when the next one comes, and images are
-//! shared among the members of the team. What concerns the whole batch (the linear layers, the decoder's first convolution, the gradients of weights) is shared by rows
-//! or columns. No sum is ever split between members.
+//! Work that concerns a single image is done image by image, so that one layer's output is still
+//! cached when the next layer reads it. The members of the team share the images. Work on the whole
+//! batch (linear layers, the decoder's first convolution, weight gradients) is shared by rows or
+//! columns. No sum is ever split between members.
 
 use skein_kernels::{Finish, Isa, Start, Team};
 use skein_protocol::IMAGE_PIXELS;
 
-use super::batch::Batch;
+use super::batch::BatchBuffers;
 use super::buffer::Buffer;
 use super::code;
 use super::elementwise::{column_sums, gate, reconstruction_error};
-use super::layer::Layer;
-use super::members::{Member, by_image, portions, share};
-use super::network::{DECODER, HEADS, LINEAR, Network, UNFOLD};
-use super::order::Affine;
+use super::layer::ConvLayer;
+use super::members::{MemberScratch, by_image, portions, share};
+use super::network::{DECODER, HEADS, LINEAR, UNFOLD, VaeNetwork};
+use super::order::LayerRanges;
 use super::stopwatch::Pass;
 
 /// The loss and its parts; see [`super::super::VaeMetrics`].
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Objective {
+pub(super) struct LossParts {
     pub(super) loss: f32,
     pub(super) error: f32,
     pub(super) divergence: f32,
 }
 
-/// What the passes work with.
-pub(super) struct Step<'a> {
+/// Everything that the passes of one step read and write.
+pub(super) struct StepContext<'a> {
     pub(super) isa: Isa,
     pub(super) team: &'a mut Team,
-    pub(super) members: &'a mut [Member],
-    pub(super) network: &'a mut Network,
-    pub(super) batch: &'a mut Batch,
+    pub(super) members: &'a mut [MemberScratch],
+    pub(super) network: &'a mut VaeNetwork,
+    pub(super) batch: &'a mut BatchBuffers,
     pub(super) parameters: &'a [f32],
     pub(super) kl_weight: f64,
 }
 
-impl Step<'_> {
-    /// The loss of depth images, `[n, 72, 128]`, and its gradient but for the weights of the decoder's first convolution, for which what flows back is left in
+impl StepContext<'_> {
+    /// Computes the loss of depth images, `[n, 72, 128]`, and its gradient. For the weights of the
+    /// decoder's first convolution, only the gradient with respect to its output is left in
     /// [`super::unfold::Unfold`]. `noise`: standard normal, `[n, latent]`.
-    pub(super) fn objective(&mut self, depth: &[u8], noise: &[f32], gradient: &mut [f32]) -> Objective {
+    pub(super) fn objective(
+        &mut self,
+        depth: &[u8],
+        noise: &[f32],
+        gradient: &mut [f32],
+    ) -> LossParts {
         let count = depth.len() / IMAGE_PIXELS;
         self.batch.resize(self.network, count);
-        self.see(depth);
-        let divergence = self.draw_codes(noise) / count as f64;
-        self.draw_and_flow_back(count);
-        self.unfold_flow_back();
-        self.code_flow_back(noise, self.kl_weight / count as f64);
-        self.see_flow_back(count);
+        self.encode(depth);
+        let divergence = self.sample_codes(noise) / count as f64;
+        self.decode_and_backward(count);
+        self.unfold_backward();
+        self.code_backward(noise, self.kl_weight / count as f64);
+        self.encoder_backward(count);
         self.gradients(gradient);
 
         let error = self.batch.errors.iter().sum::<f64>() / count as f64;
-        Objective {
+        LossParts {
             loss: (error + self.kl_weight * divergence) as f32,
             error: error as f32,
             divergence: divergence as f32,
         }
     }
 
-    /// Encoder.
-    fn see(&mut self, depth: &[u8]) {
+    /// Forward: the encoder's convolutions.
+    fn encode(&mut self, depth: &[u8]) {
         let count = depth.len() / IMAGE_PIXELS;
         let (network, parameters) = (&*self.network, self.parameters);
-        let mut images = by_image(self.batch.seen.each_mut().map(|buffer| &mut **buffer), count);
-        share(self.team, self.members, &mut images, |index, images, member| {
-            let depth = &depth[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            let images = images.each_mut().map(|image| &mut **image);
-            network.see(parameters, depth, images, &mut member.watch);
-        });
+        let mut images = by_image(
+            self.batch
+                .encoder_maps
+                .each_mut()
+                .map(|buffer| &mut **buffer),
+            count,
+        );
+        share(
+            self.team,
+            self.members,
+            &mut images,
+            |index, images, member| {
+                let depth = &depth[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                let images = images.each_mut().map(|image| &mut **image);
+                network.encoder_forward(parameters, depth, images, &mut member.watch);
+            },
+        );
     }
 
-    /// Heads, codes, the decoder's linear layer, and what it makes of the first image. Returns the sum of divergences.
-    fn draw_codes(&mut self, noise: &[f32]) -> f64 {
+    /// Forward: heads, sampled codes, and the decoder's linear layer and first convolution. Returns
+    /// the sum of the divergences.
+    fn sample_codes(&mut self, noise: &[f32]) -> f64 {
         let (network, parameters, batch) = (&mut *self.network, self.parameters, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        network
-            .heads
-            .forward(self.team, parameters, &batch.seen[4], Finish::Plain, &mut batch.heads);
+        network.heads.forward(
+            self.team,
+            parameters,
+            &batch.encoder_maps[4],
+            Finish::Plain,
+            &mut batch.heads,
+        );
         watch.layer(HEADS, Pass::Forward);
-        let divergence = code::draw(self.isa, network.latent(), &batch.heads, noise, &mut batch.codes);
+        let divergence = code::sample(
+            self.isa,
+            network.latent(),
+            &batch.heads,
+            noise,
+            &mut batch.codes,
+        );
         watch.rest();
         network.linear.forward(
             self.team,
@@ -94,152 +123,218 @@ impl Step<'_> {
         divergence
     }
 
-    /// The rest of the decoder, the squared error, and the way back to its first image.
-    fn draw_and_flow_back(&mut self, count: usize) {
+    /// Forward through the rest of the decoder, squared error, and backward to its first feature
+    /// map.
+    fn decode_and_backward(&mut self, count: usize) {
         let (isa, network, parameters) = (self.isa, &*self.network, self.parameters);
-        let Batch {
-            seen: [pixels, ..],
-            drawn: [a, b, c, d],
-            drawn_flow: [e, f, g],
-            drawn_sums,
+        let BatchBuffers {
+            encoder_maps: [pixels, ..],
+            decoder_maps: [a, b, c, d],
+            decoder_maps_grad: [e, f, g],
+            decoder_bias_sums,
             errors,
             ..
         } = &mut *self.batch;
-        let buffers: [&mut Buffer; 8] = [a, b, c, d, e, f, g, drawn_sums];
+        let buffers: [&mut Buffer; 8] = [a, b, c, d, e, f, g, decoder_bias_sums];
         let images = by_image(buffers.map(|buffer| &mut **buffer), count);
         let mut items: Vec<_> = images.into_iter().zip(errors).collect();
         let weight = 2.0 / count as f32;
-        share(self.team, self.members, &mut items, |index, (images, error), member| {
-            let Member { columns, watch, .. } = member;
-            let [a, b, c, d, e, f, g, sums] = images;
-            network.draw(parameters, index, [a, b, c, d], columns, watch);
-            let pixels = &pixels[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
-            **error = reconstruction_error(isa, d, pixels, weight);
-            watch.rest();
-            let mut sums = Sums::new(network.decoder_places(), sums);
-            let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
-            let mut flowing = &**d;
-            for (index, output, into) in ways {
-                sums.add(isa, index + 1, flowing);
-                watch.layer(DECODER + index, Pass::Gradient);
-                network.decoder[index].look(flowing, Start::Zero, Finish::Gated(output), into);
-                watch.layer(DECODER + index, Pass::Backward);
-                flowing = into;
-            }
-            sums.add(isa, 0, flowing);
-            watch.layer(UNFOLD, Pass::Gradient);
-        });
+        share(
+            self.team,
+            self.members,
+            &mut items,
+            |index, (images, error), member| {
+                let MemberScratch { columns, watch, .. } = member;
+                let [a, b, c, d, e, f, g, sums] = images;
+                network.decoder_forward(parameters, index, [a, b, c, d], columns, watch);
+                let pixels = &pixels[index * IMAGE_PIXELS..][..IMAGE_PIXELS];
+                **error = reconstruction_error(isa, d, pixels, weight);
+                watch.rest();
+                let mut sums = BiasSums::new(network.decoder_places(), sums);
+                let ways = [(2, &*c, &mut *g), (1, &*b, f), (0, &*a, e)];
+                let mut grad = &**d;
+                for (index, output, into) in ways {
+                    sums.add(isa, index + 1, grad);
+                    watch.layer(DECODER + index, Pass::Gradient);
+                    network.decoder[index].look(grad, Start::Zero, Finish::Gated(output), into);
+                    watch.layer(DECODER + index, Pass::Backward);
+                    grad = into;
+                }
+                sums.add(isa, 0, grad);
+                watch.layer(UNFOLD, Pass::Gradient);
+            },
+        );
     }
 
-    /// Through the decoder's first convolution, back to its input.
-    fn unfold_flow_back(&mut self) {
+    /// Backward through the decoder's first convolution.
+    fn unfold_backward(&mut self) {
         let (parameters, batch) = (self.parameters, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        self.network.unfold.gather(&batch.drawn_flow[0]);
+        self.network.unfold.gather(&batch.decoder_maps_grad[0]);
         watch.layer(UNFOLD, Pass::Backward);
         let (unfold, gate) = (&self.network.unfold, &batch.unfolded);
         // Whole images, so that members have equal parts.
-        let mut parts = portions(&mut batch.unfolded_flow, super::unfold::INPUT_LEN, self.members.len());
-        share(self.team, self.members, &mut parts, |_, (first, input), member| {
-            let gate = &gate[*first * super::unfold::INPUT_LEN..][..input.len()];
-            unfold.backward(parameters, &mut member.unfold, *first, gate, input);
-            member.watch.layer(UNFOLD, Pass::Backward);
-        });
+        let mut parts = portions(
+            &mut batch.unfolded_grad,
+            super::unfold::INPUT_LEN,
+            self.members.len(),
+        );
+        share(
+            self.team,
+            self.members,
+            &mut parts,
+            |_, (first, input), member| {
+                let gate = &gate[*first * super::unfold::INPUT_LEN..][..input.len()];
+                unfold.backward(parameters, &mut member.unfold, *first, gate, input);
+                member.watch.layer(UNFOLD, Pass::Backward);
+            },
+        );
     }
 
-    /// Through the code, back to the features.
-    fn code_flow_back(&mut self, noise: &[f32], divergence_weight: f64) {
+    /// Backward through linear layer, codes and heads, to the features.
+    fn code_backward(&mut self, noise: &[f32], divergence_weight: f64) {
         let (network, batch) = (&*self.network, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        network
-            .linear
-            .backward(self.team, &batch.unfolded_flow, Finish::Plain, &mut batch.codes_flow);
+        network.linear.backward(
+            self.team,
+            &batch.unfolded_grad,
+            Finish::Plain,
+            &mut batch.codes_grad,
+        );
         watch.layer(LINEAR, Pass::Backward);
         let weight = divergence_weight as f32;
-        code::flow_back(
+        code::backward(
             self.isa,
             network.latent(),
             &batch.heads,
             noise,
-            &batch.codes_flow,
+            &batch.codes_grad,
             weight,
-            &mut batch.heads_flow,
+            &mut batch.heads_grad,
         );
         watch.rest();
-        let (finish, into) = (Finish::Gated(&batch.seen[4]), &mut batch.seen_flow[3]);
-        network.heads.backward(self.team, &batch.heads_flow, finish, into);
+        let (finish, into) = (
+            Finish::Gated(&batch.encoder_maps[4]),
+            &mut batch.encoder_maps_grad[3],
+        );
+        network
+            .heads
+            .backward(self.team, &batch.heads_grad, finish, into);
         watch.layer(HEADS, Pass::Backward);
     }
 
-    /// Through the encoder, back to its first image.
-    fn see_flow_back(&mut self, count: usize) {
+    /// Backward through the encoder, to its first feature map.
+    fn encoder_backward(&mut self, count: usize) {
         let (isa, network) = (self.isa, &*self.network);
-        let Batch {
-            seen,
-            seen_flow: [a, b, c, d],
-            seen_sums,
+        let BatchBuffers {
+            encoder_maps,
+            encoder_maps_grad: [a, b, c, d],
+            encoder_bias_sums,
             ..
         } = &mut *self.batch;
-        let buffers: [&mut Buffer; 5] = [a, b, c, d, seen_sums];
+        let buffers: [&mut Buffer; 5] = [a, b, c, d, encoder_bias_sums];
         let mut images = by_image(buffers.map(|buffer| &mut **buffer), count);
-        share(self.team, self.members, &mut images, |index, images, member| {
-            let Member { columns, watch, .. } = member;
-            let [a, b, c, d, sums] = images;
-            let mut sums = Sums::new(network.encoder_places(), sums);
-            let mut flowing = &**d;
-            for (layer, into) in [(3, c), (2, b), (1, a)] {
-                sums.add(isa, layer, flowing);
-                watch.layer(layer, Pass::Gradient);
-                into.fill(0.0);
-                network.encoder[layer].spread(flowing, columns, into);
-                gate(isa, into, &seen[layer][index * into.len()..][..into.len()]);
-                watch.layer(layer, Pass::Backward);
-                flowing = into;
-            }
-            sums.add(isa, 0, flowing);
-            watch.layer(0, Pass::Gradient);
-        });
+        share(
+            self.team,
+            self.members,
+            &mut images,
+            |index, images, member| {
+                let MemberScratch { columns, watch, .. } = member;
+                let [a, b, c, d, sums] = images;
+                let mut sums = BiasSums::new(network.encoder_places(), sums);
+                let mut grad = &**d;
+                for (layer, into) in [(3, c), (2, b), (1, a)] {
+                    sums.add(isa, layer, grad);
+                    watch.layer(layer, Pass::Gradient);
+                    into.fill(0.0);
+                    network.encoder[layer].spread(grad, columns, into);
+                    gate(
+                        isa,
+                        into,
+                        &encoder_maps[layer][index * into.len()..][..into.len()],
+                    );
+                    watch.layer(layer, Pass::Backward);
+                    grad = into;
+                }
+                sums.add(isa, 0, grad);
+                watch.layer(0, Pass::Gradient);
+            },
+        );
     }
 
-    /// Of all weights but the decoder's first convolution's, and of all biases.
+    /// Computes the gradients of all biases and of all weights except the decoder's first
+    /// convolution's.
     fn gradients(&mut self, gradient: &mut [f32]) {
         let (isa, network, batch) = (self.isa, &*self.network, &*self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        let mut of_layer = |index: usize, layer: &Layer, rows: &[f32], images: &[f32], gradient: &mut [f32]| {
+        let mut of_layer = |index: usize,
+                            layer: &ConvLayer,
+                            rows: &[f32],
+                            images: &[f32],
+                            gradient: &mut [f32]| {
             layer.gradient(self.team, isa, rows, images, gradient);
             watch.layer(index, Pass::Gradient);
         };
         for (index, layer) in network.encoder.iter().enumerate() {
-            of_layer(index, layer, &batch.seen_flow[index], &batch.seen[index], gradient);
+            of_layer(
+                index,
+                layer,
+                &batch.encoder_maps_grad[index],
+                &batch.encoder_maps[index],
+                gradient,
+            );
         }
         for (index, layer) in network.decoder.iter().enumerate() {
-            let flowing = batch.drawn_flow.get(index + 1).unwrap_or(&batch.drawn[3]);
-            of_layer(DECODER + index, layer, &batch.drawn[index], flowing, gradient);
+            let grad = batch
+                .decoder_maps_grad
+                .get(index + 1)
+                .unwrap_or(&batch.decoder_maps[3]);
+            of_layer(
+                DECODER + index,
+                layer,
+                &batch.decoder_maps[index],
+                grad,
+                gradient,
+            );
         }
-        network
-            .heads
-            .gradient(self.team, isa, &batch.heads_flow, &batch.seen[4], gradient);
+        network.heads.gradient(
+            self.team,
+            isa,
+            &batch.heads_grad,
+            &batch.encoder_maps[4],
+            gradient,
+        );
         watch.layer(HEADS, Pass::Gradient);
         network
             .linear
-            .gradient(self.team, isa, &batch.unfolded_flow, &batch.codes, gradient);
+            .gradient(self.team, isa, &batch.unfolded_grad, &batch.codes, gradient);
         watch.layer(LINEAR, Pass::Gradient);
-        total(isa, network.encoder_places(), &batch.seen_sums, gradient);
-        total(isa, network.decoder_places(), &batch.drawn_sums, gradient);
+        total(
+            isa,
+            network.encoder_places(),
+            &batch.encoder_bias_sums,
+            gradient,
+        );
+        total(
+            isa,
+            network.decoder_places(),
+            &batch.decoder_bias_sums,
+            gradient,
+        );
         watch.rest();
     }
 }
 
-/// What flows back to the biases of four layers from one image, a layer behind the other.
-struct Sums<'a> {
+/// Bias gradients of four layers from one image, one layer after the other.
+struct BiasSums<'a> {
     parts: [&'a mut [f32]; 4],
 }
 
-impl<'a> Sums<'a> {
-    fn new(places: [&Affine; 4], sums: &'a mut [f32]) -> Self {
+impl<'a> BiasSums<'a> {
+    fn new(places: [&LayerRanges; 4], sums: &'a mut [f32]) -> Self {
         let mut rest = sums;
         let parts = places.map(|place| {
             let (own, others) = std::mem::take(&mut rest).split_at_mut(place.bias.len());
@@ -249,14 +344,14 @@ impl<'a> Sums<'a> {
         Self { parts }
     }
 
-    /// `flowing`: the gradient with respect to the output of the layer at this place, before its ReLU.
-    fn add(&mut self, isa: Isa, layer: usize, flowing: &[f32]) {
-        column_sums(isa, flowing, self.parts[layer]);
+    /// Adds for `layer`. `grad`: the gradient with respect to the layer's output, before its ReLU.
+    fn add(&mut self, isa: Isa, layer: usize, grad: &[f32]) {
+        column_sums(isa, grad, self.parts[layer]);
     }
 }
 
-/// The biases' gradients, from the sums of each image.
-fn total(isa: Isa, places: [&Affine; 4], sums: &[f32], gradient: &mut [f32]) {
+/// Computes the biases' gradients from the sums of all images.
+fn total(isa: Isa, places: [&LayerRanges; 4], sums: &[f32], gradient: &mut [f32]) {
     let mut total = [0.0; 512];
     let biases: usize = places.iter().map(|place| place.bias.len()).sum();
     let total = &mut total[..biases.next_multiple_of(16)];

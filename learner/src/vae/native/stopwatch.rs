@@ -1,8 +1,8 @@
-//! Where the time of a step goes, layer by layer.
+//! Time of a VAE step by layer and pass.
 
 use std::time::Instant;
 
-/// The layers, in order.
+/// Names of the layers, in order.
 pub const LAYERS: [&str; 10] = [
     "encoder.conv1",
     "encoder.conv2",
@@ -16,35 +16,35 @@ pub const LAYERS: [&str; 10] = [
     "decoder.conv4",
 ];
 
-/// What a layer does in a step.
+/// One of a layer's computations in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pass {
-    /// Its output.
+    /// Computes the output.
     Forward,
-    /// The gradient with respect to its input.
+    /// Computes the gradient with respect to the input.
     Backward,
-    /// The gradient with respect to its weights and biases.
+    /// Computes the gradient with respect to weights and biases.
     Gradient,
 }
 
 impl Pass {
-    /// All of them.
+    /// All passes, in order.
     pub const ALL: [Self; 3] = [Self::Forward, Self::Backward, Self::Gradient];
 }
 
-/// Seconds of all members together, by layer and pass.
+/// Seconds by layer and pass, summed over all team members.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Spent {
-    /// `[layer][pass]`, in the order of [`LAYERS`] and [`Pass::ALL`].
+pub struct LayerTimes {
+    /// Seconds, `[layer][pass]`, in the order of [`LAYERS`] and [`Pass::ALL`].
     pub layers: [[f64; 3]; 10],
-    /// Adam and packing the weights for the next step.
+    /// Seconds spent on Adam and on packing the weights for the next step.
     pub adam_and_packing: f64,
-    /// Pixels, codes, losses, whether all is finite.
+    /// Seconds spent on pixels, codes, losses and the check for finite numbers.
     pub rest: f64,
 }
 
-impl Spent {
-    /// Adds another member's.
+impl LayerTimes {
+    /// Adds the times of another member.
     pub(super) fn add(&mut self, other: &Self) {
         for (own, other) in self
             .layers
@@ -58,51 +58,52 @@ impl Spent {
         self.rest += other.rest;
     }
 
-    /// All seconds.
+    /// Sum of all seconds.
     pub fn total(&self) -> f64 {
         self.layers.as_flattened().iter().sum::<f64>() + self.adam_and_packing + self.rest
     }
 }
 
-/// Attributes the time between two looks at it.
+/// Books the time since the last lap under a layer or another heading.
 #[derive(Debug)]
 pub(super) struct Stopwatch {
     last: Instant,
-    pub(super) spent: Spent,
+    pub(super) times: LayerTimes,
 }
 
 impl Default for Stopwatch {
     fn default() -> Self {
         Self {
             last: Instant::now(),
-            spent: Spent::default(),
+            times: LayerTimes::default(),
         }
     }
 }
 
 impl Stopwatch {
-    /// From here on.
+    /// Starts a lap.
     pub(super) fn start(&mut self) {
         self.last = Instant::now();
     }
 
-    /// What has passed since the last look was this layer's.
+    /// Books the lap under a layer's pass.
     pub(super) fn layer(&mut self, layer: usize, pass: Pass) {
-        self.spent.layers[layer][pass as usize] += self.lap();
+        self.times.layers[layer][pass as usize] += self.lap();
     }
 
-    /// It was Adam's, or went into packing.
+    /// Books the lap under Adam and packing.
     pub(super) fn adam_and_packing(&mut self) {
-        self.spent.adam_and_packing += self.lap();
+        self.times.adam_and_packing += self.lap();
     }
 
-    /// It was something else's.
+    /// Books the lap under the rest.
     pub(super) fn rest(&mut self) {
-        self.spent.rest += self.lap();
+        self.times.rest += self.lap();
     }
 
     fn lap(&mut self) -> f64 {
         let now = Instant::now();
-        now.duration_since(std::mem::replace(&mut self.last, now)).as_secs_f64()
+        now.duration_since(std::mem::replace(&mut self.last, now))
+            .as_secs_f64()
     }
 }

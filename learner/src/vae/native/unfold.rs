@@ -1,18 +1,22 @@
 //! The decoder's first transposed convolution: three pixels of 1024 channels to 5 × 11 of 128.
 //!
-//! It has three quarters of all weights and three windows an image, so that reading the weights, not multiplying with them, would take the time. Therefore it is done for
-//! the whole batch at once, and in blocks of weights that have nothing to do with each other: what an input pixel makes of the image are five runs of seven
-//! pixels, one in each image row; a block is a part of a run, for all input channels. From its gradient through Adam to being packed for the next step, a block
-//! stays in the caches, and no gradient of the whole is ever stored.
+//! It has three quarters of all weights but only three windows per image, so reading the weights,
+//! not multiplying, would take the time. Therefore it is computed for the whole batch at once, in
+//! independent blocks of weights. An input pixel contributes five runs of seven pixels to the
+//! image, one in each image row; a block is one run, for all input channels. A block stays in the
+//! caches from its gradient through Adam to packing, and the whole gradient is never stored.
 
-use skein_kernels::{AdamStep, Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product};
+use skein_kernels::{
+    AdamStep, Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product,
+};
 
 use super::buffer::Buffer;
 use super::elementwise::{fill, squares};
 use super::layer::STRIDE;
-use super::order::Affine;
+use super::order::LayerRanges;
 
-/// Rows of the image, and of the kernel: the input has one row, so kernel row k makes image row k and nothing else.
+/// Rows of the image and of the kernel: the input has one row, so kernel row k makes image row k
+/// and nothing else.
 const ROWS: usize = 5;
 /// Pixels of the input.
 const INPUTS: usize = 3;
@@ -20,36 +24,30 @@ const INPUTS: usize = 3;
 const INPUT_CHANNELS: usize = 1024;
 const KERNEL_WIDTH: usize = 7;
 const CHANNELS: usize = 128;
-/// What an input pixel makes of an image row: seven pixels side by side.
+/// Length of an input pixel's contribution to an image row: seven pixels side by side.
 const RUN: usize = KERNEL_WIDTH * CHANNELS;
-/// Numbers in a row of the image, 11 pixels.
+/// Length of an image row, 11 pixels.
 const ROW: usize = (STRIDE * (INPUTS - 1) + KERNEL_WIDTH) * CHANNELS;
-/// Numbers in the input, and in the image.
+/// Lengths of the input and of the image.
 pub(super) const INPUT_LEN: usize = INPUTS * INPUT_CHANNELS;
 pub(super) const IMAGE_LEN: usize = ROWS * ROW;
-/// Blocks that a run is cut into. One: [`super::order::Order`] keeps the weights of a kernel row as `[1024, 7 · 128]`, so blocks of less would read them in the
-/// wrong order.
-pub(super) const PARTS: usize = 1;
-/// Numbers of a run in a block.
-const PART: usize = RUN / PARTS;
-/// Blocks of weights.
-const BLOCKS: usize = ROWS * PARTS;
-/// Weights in a block, `[1024, PART]`.
-const BLOCK: usize = INPUT_CHANNELS * PART;
+/// Weights in a block, `[1024, RUN]`. Each image row has a block.
+const BLOCK: usize = INPUT_CHANNELS * RUN;
 
-/// The layer.
+/// The layer's packed weights and the batch's columns.
 #[derive(Debug)]
 pub(super) struct Unfold {
-    pub(super) place: Affine,
-    /// Of each block, `[1024, PART]`.
-    panels: [Panels; BLOCKS],
-    /// The weights as an image, of which an input channel sees all numbers that are its own.
+    pub(super) place: LayerRanges,
+    /// Packed weights of each block, `[1024, RUN]`.
+    panels: [Panels; ROWS],
+    /// The block weights seen as an image, so that a window holds all weights of one input channel.
     weights: Windows,
-    /// What each input pixel makes of each run, or what flows back to it: `[BLOCKS, 3 n, PART]`.
+    /// Contribution of each input pixel to each run, or the gradient with respect to it:
+    /// `[ROWS, 3 n, RUN]`.
     columns: Buffer,
 }
 
-/// Working memory of a member.
+/// Working memory of one team member.
 #[derive(Debug)]
 pub(super) struct UnfoldScratch {
     team: Team,
@@ -71,94 +69,103 @@ impl UnfoldScratch {
     }
 }
 
-/// What a member needs to move a block of weights.
+/// One block of weights, with all that its update needs.
 #[derive(Debug)]
-pub(super) struct Block<'a> {
+pub(super) struct WeightBlock<'a> {
     panels: &'a mut Panels,
-    /// What flows back, `[3 n, PART]`.
+    /// Gradient with respect to the block's output, `[3 n, RUN]`.
     columns: &'a [f32],
     weights: &'a mut [f32],
     moments: [&'a mut [f32]; 2],
 }
 
 impl Unfold {
-    pub(super) fn new(isa: Isa, place: Affine) -> Self {
-        assert_eq!(place.weight.len(), BLOCKS * BLOCK, "the layer's weights");
+    pub(super) fn new(isa: Isa, place: LayerRanges) -> Self {
+        assert_eq!(place.weight.len(), ROWS * BLOCK, "the layer's weights");
         Self {
             place,
             panels: std::array::from_fn(|_| Panels::new(isa)),
-            weights: Windows::new([BLOCKS, INPUT_CHANNELS], PART, [BLOCKS, 1], 1),
+            weights: Windows::new([ROWS, INPUT_CHANNELS], RUN, [ROWS, 1], 1),
             columns: Buffer::default(),
         }
     }
 
-    /// Takes over the weights.
+    /// Packs the present weights.
     pub(super) fn pack(&mut self, parameters: &[f32]) {
         let weights = parameters[self.place.weight.clone()].chunks_exact(BLOCK);
         for (panels, weights) in self.panels.iter_mut().zip(weights) {
-            panels.pack(Matrix::of_rows(weights, PART));
+            panels.pack(Matrix::of_rows(weights, RUN));
         }
     }
 
-    /// First half of the forward pass: what each input pixel, `[3 n, 1024]`, makes of the image.
+    /// First half of the forward pass: multiplies each input pixel, `[3 n, 1024]`, with all blocks.
     pub(super) fn multiply(&mut self, team: &mut Team, input: &[f32]) {
         let pixels = input.len() / INPUT_CHANNELS;
-        self.columns.resize(BLOCKS * pixels * PART);
-        for (panels, columns) in self.panels.iter().zip(self.columns.chunks_exact_mut(pixels * PART)) {
-            team.split_rows(columns, PART, 1, |first, columns| {
-                let rows = &input[first * INPUT_CHANNELS..][..columns.len() / PART * INPUT_CHANNELS];
-                product(Rows::Matrix(rows), panels, Start::Zero, Finish::Plain, columns);
+        self.columns.resize(ROWS * pixels * RUN);
+        for (panels, columns) in self
+            .panels
+            .iter()
+            .zip(self.columns.chunks_exact_mut(pixels * RUN))
+        {
+            team.split_rows(columns, RUN, 1, |first, columns| {
+                let rows = &input[first * INPUT_CHANNELS..][..columns.len() / RUN * INPUT_CHANNELS];
+                product(
+                    Rows::Matrix(rows),
+                    panels,
+                    Start::Zero,
+                    Finish::Plain,
+                    columns,
+                );
             });
         }
     }
 
-    /// Second half: image number `index` of the batch, `[5, 11, 128]`, before its ReLU.
+    /// Second half: adds up image `index` of the batch, `[5, 11, 128]`, before its ReLU.
     pub(super) fn add_up(&self, isa: Isa, bias: &[f32], index: usize, image: &mut [f32]) {
         fill(image, bias);
         for (row, image) in image.chunks_exact_mut(ROW).enumerate() {
             for pixel in 0..INPUTS {
-                let into = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact_mut(PART);
-                for (part, into) in into.enumerate() {
-                    let from = self.column(row * PARTS + part, INPUTS * index + pixel);
-                    isa.vectorised(
-                        #[inline(always)]
-                        || {
-                            for (into, from) in into.iter_mut().zip(from) {
-                                *into += from;
-                            }
-                        },
-                    );
-                }
+                let into = &mut image[pixel * STRIDE * CHANNELS..][..RUN];
+                let from = self.column(row, INPUTS * index + pixel);
+                isa.vectorised(
+                    #[inline(always)]
+                    || {
+                        for (into, from) in into.iter_mut().zip(from) {
+                            *into += from;
+                        }
+                    },
+                );
             }
         }
     }
 
     fn column(&self, block: usize, pixel: usize) -> &[f32] {
-        let pixels = self.columns.len() / (BLOCKS * PART);
-        &self.columns[(block * pixels + pixel) * PART..][..PART]
+        let pixels = self.columns.len() / (ROWS * RUN);
+        &self.columns[(block * pixels + pixel) * RUN..][..RUN]
     }
 
-    /// First half of the backward pass: what each input pixel sees of the gradient flowing back to the images, `[n, 5, 11, 128]`.
-    pub(super) fn gather(&mut self, flowing: &[f32]) {
-        let images = flowing.len() / (ROWS * ROW);
-        self.columns.resize(BLOCKS * INPUTS * images * PART);
-        for (index, image) in flowing.chunks_exact(ROWS * ROW).enumerate() {
+    /// First half of the backward pass: gathers the columns of each input pixel from the gradient
+    /// with respect to the images, `[n, 5, 11, 128]`.
+    pub(super) fn gather(&mut self, grad: &[f32]) {
+        let images = grad.len() / (ROWS * ROW);
+        self.columns.resize(ROWS * INPUTS * images * RUN);
+        for (index, image) in grad.chunks_exact(ROWS * ROW).enumerate() {
             for (row, image) in image.chunks_exact(ROW).enumerate() {
                 for pixel in 0..INPUTS {
-                    let from = image[pixel * STRIDE * CHANNELS..][..RUN].chunks_exact(PART);
-                    for (part, from) in from.enumerate() {
-                        let place = ((row * PARTS + part) * images + index) * INPUTS + pixel;
-                        self.columns[place * PART..][..PART].copy_from_slice(from);
-                    }
+                    let from = &image[pixel * STRIDE * CHANNELS..][..RUN];
+                    let place = (row * images + index) * INPUTS + pixel;
+                    self.columns[place * RUN..][..RUN].copy_from_slice(from);
                 }
             }
         }
     }
 
-    /// Second half: the gradient with respect to the inputs of some images, `[3 · images, 1024]`, the first of which is number `first` of the batch; nought where
-    /// `gate` is.
+    /// Second half: computes the gradient with respect to the inputs of some images,
+    /// `[3 · images, 1024]`, starting with image `first` of the batch. It is zero where `gate` is
+    /// not positive.
     ///
-    /// The weights are the left operand, read where they lie, and not packed for it: pixels are few, weights are many.
+    /// The weights are the left operand and are read in place, not packed: pixels are few, weights
+    /// are many.
     pub(super) fn backward(
         &self,
         parameters: &[f32],
@@ -174,13 +181,13 @@ impl Unfold {
             transposed,
             ..
         } = scratch;
-        seen.resize(pixels * BLOCKS * PART);
-        for (pixel, seen) in seen.chunks_exact_mut(BLOCKS * PART).enumerate() {
-            for (block, seen) in seen.chunks_exact_mut(PART).enumerate() {
+        seen.resize(pixels * ROWS * RUN);
+        for (pixel, seen) in seen.chunks_exact_mut(ROWS * RUN).enumerate() {
+            for (block, seen) in seen.chunks_exact_mut(RUN).enumerate() {
                 seen.copy_from_slice(self.column(block, INPUTS * first + pixel));
             }
         }
-        panels.pack(Matrix::of_rows(seen, BLOCKS * PART).transposed());
+        panels.pack(Matrix::of_rows(seen, ROWS * RUN).transposed());
         transposed.resize(input.len());
         let weights = Rows::Windows(&self.weights, &parameters[self.place.weight.clone()]);
         product(weights, panels, Start::Zero, Finish::Plain, transposed);
@@ -199,50 +206,75 @@ impl Unfold {
         }
     }
 
-    /// At least the sum of the weights' gradient's squares (Cauchy and Schwarz): if it is finite, so is each of them.
+    /// Upper bound of the squared norm of the weights' gradient (Cauchy and Schwarz): if it is
+    /// finite, the gradient is.
     pub(super) fn gradient_bound(&self, isa: Isa, input: &[f32]) -> f64 {
         squares(isa, input) * squares(isa, &self.columns)
     }
 
-    /// The weights in blocks.
-    pub(super) fn blocks<'a>(&'a mut self, parameters: &'a mut [f32], moments: [&'a mut [f32]; 2]) -> Vec<Block<'a>> {
+    /// Splits the weights, their moments and columns into blocks.
+    pub(super) fn blocks<'a>(
+        &'a mut self,
+        parameters: &'a mut [f32],
+        moments: [&'a mut [f32]; 2],
+    ) -> Vec<WeightBlock<'a>> {
         let range = self.place.weight.clone();
         let [first, second] = moments.map(|moment| moment[range.clone()].chunks_exact_mut(BLOCK));
-        let columns = self.columns.chunks_exact(self.columns.len() / BLOCKS);
+        let columns = self.columns.chunks_exact(self.columns.len() / ROWS);
         let weights = parameters[range].chunks_exact_mut(BLOCK);
-        let blocks = self.panels.iter_mut().zip(columns).zip(weights).zip(first.zip(second));
+        let blocks = self
+            .panels
+            .iter_mut()
+            .zip(columns)
+            .zip(weights)
+            .zip(first.zip(second));
         blocks
-            .map(|(((panels, columns), weights), (first, second))| Block {
-                panels,
-                columns,
-                weights,
-                moments: [first, second],
-            })
+            .map(
+                |(((panels, columns), weights), (first, second))| WeightBlock {
+                    panels,
+                    columns,
+                    weights,
+                    moments: [first, second],
+                },
+            )
             .collect()
     }
 
-    /// Operations of one pass, for an image.
+    /// Operations of one pass per image.
     pub(super) fn operations() -> f64 {
-        2.0 * (INPUTS * BLOCKS * BLOCK) as f64
+        2.0 * (INPUTS * ROWS * BLOCK) as f64
     }
 }
 
-impl Block<'_> {
-    /// The gradient of this block's weights, `[1024, PART]`. `input`: `[3 n, 1024]`.
-    pub(super) fn gradient<'a>(&self, isa: Isa, input: &[f32], scratch: &'a mut UnfoldScratch) -> &'a [f32] {
+impl WeightBlock<'_> {
+    /// The gradient of this block's weights, `[1024, RUN]`. `input`: `[3 n, 1024]`.
+    pub(super) fn gradient<'a>(
+        &self,
+        isa: Isa,
+        input: &[f32],
+        scratch: &'a mut UnfoldScratch,
+    ) -> &'a [f32] {
         let UnfoldScratch {
-            team, gradient: found, ..
+            team,
+            gradient: found,
+            ..
         } = scratch;
         found.resize(BLOCK);
         let left = Matrix::of_rows(input, INPUT_CHANNELS);
-        gradient(team, isa, left, Terms::Matrix(self.columns, PART), found);
+        gradient(team, isa, left, Terms::Matrix(self.columns, RUN), found);
         found
     }
 
-    /// Moves the weights against the gradient left by [`Block::gradient`], and packs them.
+    /// Applies Adam with the gradient left by [`WeightBlock::gradient`], and packs the weights.
     pub(super) fn step(&mut self, isa: Isa, adam: AdamStep, scratch: &mut UnfoldScratch) {
         let [first, second] = &mut self.moments;
-        adam.apply(&mut scratch.team, isa, self.weights, &scratch.gradient, [first, second]);
-        self.panels.pack(Matrix::of_rows(self.weights, PART));
+        adam.apply(
+            &mut scratch.team,
+            isa,
+            self.weights,
+            &scratch.gradient,
+            [first, second],
+        );
+        self.panels.pack(Matrix::of_rows(self.weights, RUN));
     }
 }

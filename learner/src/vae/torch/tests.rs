@@ -1,6 +1,6 @@
 //! The whole step: exactness, determinism, and that it learns.
 
-use skein_protocol::config::{DecoderName, Observation, View};
+use skein_protocol::config::{DecoderName, Observation, ObservationLayout};
 use skein_protocol::snapshot::SnapshotLayout;
 
 use super::*;
@@ -24,7 +24,10 @@ fn squared_error_is_summed_over_pixels_and_averaged_over_images() {
     let seen = Tensor::from_slice(&[0.0_f32, 1.0, 0.5, 0.5]).view([2, 1, 1, 2]);
     let reconstructed = Tensor::from_slice(&[0.5_f32, 0.5, 0.5, 1.0]).view([2, 1, 1, 2]);
     // ((0.25 + 0.25) + (0 + 0.25)) / 2
-    assert_eq!(squared_error(&reconstructed, &seen).double_value(&[]), 0.375);
+    assert_eq!(
+        squared_error(&reconstructed, &seen).double_value(&[]),
+        0.375
+    );
 }
 
 #[test]
@@ -40,10 +43,16 @@ fn divergence_matches_hand_calculation() {
 #[test]
 fn the_published_part_is_the_snapshots_encoder() {
     let vae = vae(1);
-    let layout = SnapshotLayout::new(&View::present(Observation::Latent, 32), 8);
+    let layout = SnapshotLayout::new(&ObservationLayout::present(Observation::Latent, 32), 8);
     assert_eq!(layout.encoder(), 0..vae.published_len());
     let mut start = 0;
-    for (ours, snapshots) in vae.parameters.layout().tensors().iter().zip(layout.tensors()) {
+    for (ours, snapshots) in vae
+        .parameters
+        .layout()
+        .tensors()
+        .iter()
+        .zip(layout.tensors())
+    {
         if start == vae.published_len() {
             break;
         }
@@ -61,7 +70,10 @@ fn the_published_part_is_the_snapshots_encoder() {
 #[test]
 fn the_decoder_gives_images_of_the_cameras_size() {
     let vae = vae(1);
-    assert_eq!(vae.reconstruct(&synthetic_images(2, 1)).size(), [2, 72, 128]);
+    assert_eq!(
+        vae.reconstruct(&synthetic_images(2, 1)).size(),
+        [2, 72, 128]
+    );
     assert_eq!(vae.encode(&images_from_bytes(&[])).size(), [0, 32]);
 }
 
@@ -71,7 +83,11 @@ fn images_are_encoded_alike_in_one_chunk_and_in_several() {
     let together = vae.encode(&images);
     assert_eq!(together.size(), [CHUNK + 3, 32]);
     let apart = vae.encode(&images.narrow(0, CHUNK, 3));
-    assert!(together.narrow(0, CHUNK, 3).allclose(&apart, 1e-4, 1e-5, false));
+    assert!(
+        together
+            .narrow(0, CHUNK, 3)
+            .allclose(&apart, 1e-4, 1e-5, false)
+    );
 }
 
 #[test]
@@ -83,7 +99,8 @@ fn gradient_matches_finite_differences() {
     let loss = |vae: &TorchVae| vae.objective(&pixels, &code_noise).loss;
     let gradient = vae.parameters.gradient(&loss(&vae));
 
-    // Along its own gradient, the loss of each tensor rises by the gradient's length: a tensor out of place in the flat vector would show.
+    // Along its own gradient, the loss rises by the gradient's norm. A tensor out of place in the
+    // flat vector would show.
     let _guard = no_grad_guard();
     let mut start = 0;
     for tensor in vae.parameters.layout().clone().tensors() {
@@ -117,14 +134,22 @@ fn a_vae_learns_to_reproduce_images_it_was_not_trained_on() {
     let code_noise = Noise::new(5).normal(&[16, 32], Device::Cpu);
     let error = |vae: &TorchVae| {
         let _guard = no_grad_guard();
-        vae.objective(&pixels(&unseen), &code_noise).error.double_value(&[]) / IMAGE_PIXELS as f64
+        vae.objective(&pixels(&unseen), &code_noise)
+            .error
+            .double_value(&[])
+            / IMAGE_PIXELS as f64
     };
     let untrained = error(&vae);
     let mut noise = Noise::new(4);
     for step in 0..24 {
-        let metrics = vae.update(&seen.narrow(0, step % 8 * 8, 8), &mut noise).unwrap();
+        let metrics = vae
+            .update(&seen.narrow(0, step % 8 * 8, 8), &mut noise)
+            .unwrap();
         let parts = metrics.pixel_error * IMAGE_PIXELS as f32 + metrics.divergence;
-        assert!((metrics.loss - parts).abs() < 0.01 * metrics.loss, "{metrics:?}");
+        assert!(
+            (metrics.loss - parts).abs() < 0.01 * metrics.loss,
+            "{metrics:?}"
+        );
     }
     assert!(
         error(&vae) < 0.4 * untrained,
@@ -144,7 +169,10 @@ fn a_restored_vae_continues_bit_for_bit() {
 
     let mut resumed = self::vae(9);
     resumed.load_named(&stored).unwrap();
-    assert_eq!(resumed.update(&images, &mut Noise::new(2)).unwrap(), expected);
+    assert_eq!(
+        resumed.update(&images, &mut Noise::new(2)).unwrap(),
+        expected
+    );
     assert_eq!(bits(resumed.parameters.flat()), bits(vae.parameters.flat()));
 }
 
@@ -153,7 +181,9 @@ fn a_non_finite_loss_changes_nothing() {
     let mut vae = vae(1);
     vae.kl_weight = f64::INFINITY;
     let before = vae.parameters.flat().copy();
-    let error = vae.update(&synthetic_images(2, 1), &mut Noise::new(1)).unwrap_err();
+    let error = vae
+        .update(&synthetic_images(2, 1), &mut Noise::new(1))
+        .unwrap_err();
     assert_eq!(
         error,
         UpdateError::NonFinite {
@@ -165,7 +195,7 @@ fn a_non_finite_loss_changes_nothing() {
 }
 
 #[test]
-fn a_u_net_reproduces_what_a_plain_decoder_cannot_and_ends_with_the_same_encoder_for_actors() {
+fn a_u_net_reproduces_more_than_a_plain_decoder_and_publishes_an_encoder_of_equal_layout() {
     let section = VaeSection {
         decoder: DecoderName::UNet,
         ..VaeSection::default()
@@ -179,13 +209,17 @@ fn a_u_net_reproduces_what_a_plain_decoder_cannot_and_ends_with_the_same_encoder
         vae.publish(&mut values);
         values
     };
-    assert_eq!(published(&u_net), published(&plain), "both begin alike");
+    assert_eq!(published(&u_net), published(&plain), "both start alike");
     let images = synthetic_images(8, 1);
     assert_eq!(u_net.reconstruct(&images).size(), [8, 72, 128]);
     let mut noise = [Noise::new(4), Noise::new(4)];
     let mut errors = [0.0; 2];
     for _ in 0..24 {
-        for ((vae, noise), error) in [&mut u_net, &mut plain].into_iter().zip(&mut noise).zip(&mut errors) {
+        for ((vae, noise), error) in [&mut u_net, &mut plain]
+            .into_iter()
+            .zip(&mut noise)
+            .zip(&mut errors)
+        {
             *error = vae.update(&images, noise).unwrap().pixel_error;
         }
     }
@@ -204,11 +238,15 @@ fn a_u_nets_decoder_sees_the_middle_of_every_map() {
     let sees = |section: &VaeSection| {
         let vae = TorchVae::new(section, 1, Device::Cpu);
         let _guard = no_grad_guard();
-        let encoded = vae.encoder.encode(&vae.parameters, &pixels(&synthetic_images(1, 1)));
-        let reconstruct = |maps: &[Tensor; 3]| vae.decoder.forward(&vae.parameters, &encoded.mean, maps);
+        let encoded = vae
+            .encoder
+            .encode(&vae.parameters, &pixels(&synthetic_images(1, 1)));
+        let reconstruct =
+            |maps: &[Tensor; 3]| vae.decoder.forward(&vae.parameters, &encoded.mean, maps);
         let whole = reconstruct(&encoded.maps);
         std::array::from_fn::<_, 3, _>(|changed| {
-            let maps = std::array::from_fn(|map| &encoded.maps[map] + f64::from(u8::from(map == changed)));
+            let maps =
+                std::array::from_fn(|map| &encoded.maps[map] + f64::from(u8::from(map == changed)));
             reconstruct(&maps) != whole
         })
     };

@@ -1,5 +1,5 @@
-//! What a learner resumes from: each file of a checkpoint under a manifest that matches it, so that what stands behind the checksums is reached; and the
-//! metrics that it goes on with.
+//! Files that a learner resumes from: each file of a checkpoint under a matching manifest, so that
+//! the code behind the checksums is reached; and the metrics that it continues.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,12 +7,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, LazyLock};
 
-use skein_learner::checkpoint::{CheckpointState, CheckpointStore, EpochOrder, Progress, checkpoint_directory};
+use skein_learner::checkpoint::{
+    CheckpointState, CheckpointStore, EpochOrder, TrainingProgress, checkpoint_directory,
+};
 use skein_learner::disk::Disk;
-use skein_learner::flights::assembly::Keep;
-use skein_learner::metrics::{EventFile, EventWriter, FlightRow, FlightsCsv};
+use skein_learner::episodes::assembly::KeptData;
+use skein_learner::metrics::{EpisodeRow, EpisodesCsv, EventFile, EventWriter};
 use skein_learner::replay::Replay;
-use skein_learner::state::{NamedTensor, Part, Stateful, TensorValues};
+use skein_learner::state::{NamedTensor, StatePart, Stateful, TensorValues};
 use skein_protocol::config::Config;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
@@ -21,31 +23,32 @@ use skein_protocol::transition::Outcome;
 use tch::Tensor;
 use tempfile::TempDir;
 
-use super::replay::{config, flight};
-use super::{Target, USUAL, Verdict, tagged};
+use super::replay::{config, episode};
+use super::{ReaderDecision, Target, USUAL, tagged};
 use crate::scratch::{folder, with_files};
 
 pub(super) const FILES: Target = Target {
     name: "checkpoint",
-    reads: "the files of a checkpoint, which one says the first byte, of tensors the header only; then what is loaded is used",
+    reads: "the files of a checkpoint, selected by the first byte (only the header of tensors); \
+            what is loaded is used",
     longest_bytes: 4096,
     weight: USUAL / 4,
     samples,
     run: checkpoint,
 };
 
-pub(super) const FLIGHTS_CSV: Target = Target {
-    name: "flights_csv",
-    reads: "flights.csv, after a byte that says after how many flights it is to be continued",
+pub(super) const EPISODES_CSV: Target = Target {
+    name: "episodes_csv",
+    reads: "episodes.csv, after a byte with the number of episodes to continue from",
     longest_bytes: 2048,
     weight: USUAL / 2,
     samples: csv_samples,
-    run: flights_csv,
+    run: episodes_csv,
 };
 
 pub(super) const EVENT_FILES: Target = Target {
     name: "event_files",
-    reads: "names and lengths of the event files that a checkpoint counts on, one a line",
+    reads: "names and lengths of the event files of a checkpoint, one per line",
     longest_bytes: 256,
     weight: USUAL / 5,
     samples: || {
@@ -57,9 +60,10 @@ pub(super) const EVENT_FILES: Target = Target {
     run: event_files,
 };
 
-/// Flights that the checkpoint is of.
-const FLIGHTS: u64 = 7;
-/// What the first byte of an input counts through. The configuration is read only to say what differs, the manifest before all else.
+/// Number of episodes before the checkpoint.
+const EPISODES: u64 = 7;
+/// Files that the first byte of an input selects. The configuration is only read to report
+/// differences; the manifest is read first of all.
 const FILE_NAMES: [&str; 6] = [
     "tensors.safetensors",
     "replay.safetensors",
@@ -69,28 +73,28 @@ const FILE_NAMES: [&str; 6] = [
     "manifest.json",
 ];
 
-/// A small state with everything in it.
+/// Returns a small state with all kinds of content.
 fn state() -> CheckpointState {
     let mut replay = Replay::new(&config());
-    replay.insert(flight()).unwrap();
+    replay.insert(episode()).unwrap();
     let tensor = |name: &str, shape: &[usize], values| NamedTensor {
         name: name.to_owned(),
         shape: shape.to_vec(),
         values,
     };
     CheckpointState {
-        progress: Progress {
-            flights: FLIGHTS,
+        progress: TrainingProgress {
+            episodes: EPISODES,
             epochs: 2,
             version: 2,
-            in_the_air: vec![EpochOrder {
+            in_flight: vec![EpochOrder {
                 epoch: 2,
                 policy_version: 1,
                 exploration: Exploration::Sample,
-                keep: Keep::Depth,
+                keep: KeptData::Depth,
             }],
             latest_candidate: Some(5),
-            ..Progress::start(config().evaluation.window_flights as usize)
+            ..TrainingProgress::start(config().evaluation.window_episodes as usize)
         },
         tensors: vec![
             tensor("single", &[3, 2], TensorValues::F32(vec![0.5; 6])),
@@ -107,13 +111,13 @@ fn state() -> CheckpointState {
     }
 }
 
-/// A folder with one sound checkpoint, and what its files hold.
-struct Sound {
+/// A folder with one valid checkpoint, and the contents of its files.
+struct ValidCheckpoint {
     folder: TempDir,
     files: BTreeMap<&'static str, Vec<u8>>,
 }
 
-impl Sound {
+impl ValidCheckpoint {
     fn write() -> Self {
         let folder = folder();
         let place = store(folder.path(), &config()).save(&state(), &[]).unwrap();
@@ -125,26 +129,26 @@ impl Sound {
     }
 
     fn place(&self) -> PathBuf {
-        checkpoint_directory(self.folder.path(), FLIGHTS)
+        checkpoint_directory(self.folder.path(), EPISODES)
     }
 }
 
 thread_local! {
-    static SOUND: Sound = Sound::write();
+    static SOUND: ValidCheckpoint = ValidCheckpoint::write();
 }
 
 fn store(folder: &Path, config: &Config) -> CheckpointStore {
     CheckpointStore::new(folder, config)
 }
 
-/// Of a safetensors file: length, header, values.
+/// Splits a safetensors file: length, header, values.
 fn parts(file: &[u8]) -> (&[u8], &[u8], &[u8]) {
     let (length, rest) = file.split_at(8);
     let (header, values) = rest.split_at(u64::from_le_bytes(length.try_into().unwrap()) as usize);
     (length, header, values)
 }
 
-/// What comes before the manifest's own checksum, which is made right for whatever comes before it.
+/// Returns the part of the manifest before its own checksum, which is recomputed for any contents.
 fn manifest_body(manifest: &[u8]) -> &[u8] {
     let before = b",\n  \"xxh3\"";
     &manifest[..manifest
@@ -167,7 +171,7 @@ fn samples() -> Vec<Vec<u8>> {
                     assert_eq!(
                         &manifest(manifest_body(file)),
                         file,
-                        "manifests are written otherwise now"
+                        "the format of manifests has changed"
                     );
                     manifest_body(file).to_vec()
                 }
@@ -182,9 +186,9 @@ fn samples() -> Vec<Vec<u8>> {
     })
 }
 
-fn checkpoint(bytes: &[u8]) -> Verdict {
+fn checkpoint(bytes: &[u8]) -> ReaderDecision {
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = FILE_NAMES[usize::from(kind) % FILE_NAMES.len()];
     SOUND.with(|sound| {
@@ -200,25 +204,25 @@ fn checkpoint(bytes: &[u8]) -> Verdict {
         fs::write(&path, file).unwrap();
         if name != "manifest.json" {
             store(sound.folder.path(), &config())
-                .seal(&sound.place(), FLIGHTS)
+                .seal(&sound.place(), EPISODES)
                 .unwrap();
         }
         let mut reader = config();
-        // Under the configuration it was written under, nobody looks at it.
+        // It is only compared if the configurations differ.
         reader.run.seed += u64::from(name == "config.toml");
-        let loaded = store(sound.folder.path(), &reader).load(FLIGHTS);
+        let loaded = store(sound.folder.path(), &reader).load(EPISODES);
         fs::write(path, &sound.files[name]).unwrap();
         if let Err(error) = &loaded {
             let folder = sound.folder.path().display().to_string();
             assert!(error.to_string().contains(&folder), "{error}");
         }
-        Verdict::of(loaded.ok().map(go_on))
+        ReaderDecision::of(loaded.ok().map(go_on))
     })
 }
 
-/// Uses what was loaded as far as it can be used without networks.
+/// Uses the loaded state as far as possible without networks.
 fn go_on(state: CheckpointState) {
-    assert_eq!(state.progress.flights, FLIGHTS);
+    assert_eq!(state.progress.episodes, EPISODES);
     let mut windows = state.progress.metrics.windows;
     let is_full = windows.walls_passed.is_full();
     windows.walls_passed.push(1.0);
@@ -238,11 +242,11 @@ fn go_on(state: CheckpointState) {
         }
     }
     if let Ok(mut replay) = Replay::restore(&config(), state.replay) {
-        let _ = replay.insert(flight());
+        let _ = replay.insert(episode());
     }
 }
 
-/// A state of one part, of each sort that there is.
+/// A state of one part, of each existing kind.
 struct Own {
     part: &'static str,
     tensor: Tensor,
@@ -255,22 +259,22 @@ impl Own {
 }
 
 impl Stateful for Own {
-    fn parts(&mut self) -> Vec<(String, Part<'_>)> {
+    fn parts(&mut self) -> Vec<(String, StatePart<'_>)> {
         let part = match self.part {
-            "single" => Part::Tensor(self.tensor.shallow_clone()),
-            "flat" => Part::Numbers(&mut self.numbers),
-            _ => Part::Count(&mut self.count),
+            "single" => StatePart::Tensor(self.tensor.shallow_clone()),
+            "flat" => StatePart::Numbers(&mut self.numbers),
+            _ => StatePart::Count(&mut self.count),
         };
         vec![(self.part.to_owned(), part)]
     }
 }
 
-/// A disk that nobody waits for.
+/// A disk on which no write waits.
 static DISK: LazyLock<Disk> = LazyLock::new(|| Disk::new(Arc::new(AtomicBool::new(true))));
 
-fn row(flight: u64) -> FlightRow {
-    FlightRow {
-        flight,
+fn row(episode: u64) -> EpisodeRow {
+    EpisodeRow {
+        episode,
         epoch: 0,
         policy_version: 0,
         actor: 1,
@@ -284,9 +288,9 @@ fn row(flight: u64) -> FlightRow {
 
 fn csv_samples() -> Vec<Vec<u8>> {
     let folder = folder();
-    let path = folder.path().join("flights.csv");
-    let mut csv = FlightsCsv::create(&path, &DISK).unwrap();
-    (0..4).for_each(|flight| csv.write(&row(flight)).unwrap());
+    let path = folder.path().join("episodes.csv");
+    let mut csv = EpisodesCsv::create(&path, &DISK).unwrap();
+    (0..4).for_each(|episode| csv.write(&row(episode)).unwrap());
     csv.flush().unwrap();
     let file = fs::read(path).unwrap();
     vec![
@@ -297,28 +301,28 @@ fn csv_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn flights_csv(bytes: &[u8]) -> Verdict {
-    let Some((&flights, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+fn episodes_csv(bytes: &[u8]) -> ReaderDecision {
+    let Some((&episodes, content)) = bytes.split_first() else {
+        return ReaderDecision::Refused;
     };
-    let flights = u64::from(flights);
-    with_files(&[("flights.csv", content)], |folder| {
-        let path = folder.join("flights.csv");
-        let mut csv = match FlightsCsv::resume(&path, flights, &DISK) {
+    let episodes = u64::from(episodes);
+    with_files(&[("episodes.csv", content)], |folder| {
+        let path = folder.join("episodes.csv");
+        let mut csv = match EpisodesCsv::resume(&path, episodes, &DISK) {
             Ok(csv) => csv,
             Err(error) => {
-                assert!(error.to_string().contains("flights.csv"), "{error}");
-                return Verdict::Refused;
+                assert!(error.to_string().contains("episodes.csv"), "{error}");
+                return ReaderDecision::Refused;
             }
         };
-        csv.write(&row(flights)).unwrap();
+        csv.write(&row(episodes)).unwrap();
         csv.flush().unwrap();
-        FlightsCsv::resume(&path, flights + 1, &DISK).unwrap();
-        Verdict::Accepted
+        EpisodesCsv::resume(&path, episodes + 1, &DISK).unwrap();
+        ReaderDecision::Accepted
     })
 }
 
-fn event_files(bytes: &[u8]) -> Verdict {
+fn event_files(bytes: &[u8]) -> ReaderDecision {
     let file = |line: &[u8]| {
         let line = String::from_utf8_lossy(line).into_owned();
         let (name, bytes) = line.rsplit_once(' ')?;
@@ -327,19 +331,30 @@ fn event_files(bytes: &[u8]) -> Verdict {
             bytes: bytes.parse().ok()?,
         })
     };
-    let files: Vec<EventFile> = bytes.split(|byte| *byte == b'\n').filter_map(file).collect();
+    let files: Vec<EventFile> = bytes
+        .split(|byte| *byte == b'\n')
+        .filter_map(file)
+        .collect();
     with_files(&[("outside", b"untouched")], |folder| {
         let curves = folder.join("tensorboard");
         fs::create_dir_all(&curves).unwrap();
-        fs::write(curves.join("events.out.tfevents.1.skein.000000"), b"12345678").unwrap();
+        fs::write(
+            curves.join("events.out.tfevents.1.skein.000000"),
+            b"12345678",
+        )
+        .unwrap();
         let mut resumed = EventWriter::resume(&curves, files.clone(), 0, &DISK).ok();
         if let Some(writer) = &mut resumed {
             writer.scalars(1, &[("a", 1.0)]).unwrap();
             writer.flush().unwrap();
         }
         fs::remove_dir_all(curves).unwrap();
-        assert_eq!(fs::read(folder.join("outside")).unwrap(), b"untouched", "{files:?}");
-        // The last one is the file just begun.
-        Verdict::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
+        assert_eq!(
+            fs::read(folder.join("outside")).unwrap(),
+            b"untouched",
+            "{files:?}"
+        );
+        // The last file is the one just begun.
+        ReaderDecision::of(resumed.filter(|writer| writer.files().len() == files.len() + 1))
     })
 }

@@ -1,4 +1,5 @@
-//! Courses: from a file, from a layout that a file may spell, and drawn from ranges. What is accepted can be flown, from every level.
+//! Courses: from a file, from a layout that a file may describe, and drawn from ranges. An accepted
+//! course can be flown from every level.
 
 use std::sync::Arc;
 
@@ -6,13 +7,14 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::IMAGE_PIXELS;
 use skein_simulator::course::{
-    Corridor, Course, CourseLayout, GeneratedShape, GeneratorRanges, Opening, Shape, StartArea, WallLabel, WallLayout,
+    Corridor, Course, CourseLayout, GeneratedShape, GeneratorRanges, Opening, Shape, StartArea,
+    WallLabel, WallLayout,
 };
 use skein_simulator::reward::RewardTerms;
-use skein_simulator::simulator::{Outcome, Simulator, SimulatorSettings};
+use skein_simulator::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use skein_simulator::suite::Suite;
 
-use super::{Target, USUAL, Verdict, shipped, text};
+use super::{ReaderDecision, Target, USUAL, shipped, text};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
@@ -25,27 +27,27 @@ pub(super) const FILE: Target = Target {
         Some(Ok(course)) => assert_flyable(course),
         Some(Err(error)) => {
             assert!(error.to_string().contains("fuzzed.toml"), "{error}");
-            Verdict::Refused
+            ReaderDecision::Refused
         }
-        None => Verdict::Refused,
+        None => ReaderDecision::Refused,
     },
 };
 
 pub(super) const LAYOUT: Target = Target {
     name: "course_layout",
-    reads: "courses of any geometry, spelt by a script of choices",
+    reads: "courses of any geometry, built from a script of choices",
     longest_bytes: 1024,
     weight: USUAL / 10,
     samples: layout_samples,
     run: |bytes| match Course::new(layout(&mut Script::new(bytes))) {
         Ok(course) => assert_flyable(course),
-        Err(_) => Verdict::Refused,
+        Err(_) => ReaderDecision::Refused,
     },
 };
 
 pub(super) const GENERATOR: Target = Target {
     name: "generator",
-    reads: "ranges of generated courses, spelt by a script of choices",
+    reads: "ranges of generated courses, built from a script of choices",
     longest_bytes: 256,
     weight: USUAL / 20,
     samples: generator_samples,
@@ -54,14 +56,14 @@ pub(super) const GENERATOR: Target = Target {
         let seed = script.u64();
         match Course::generate(seed, &ranges(&mut script)) {
             Ok(course) => assert_flyable(course),
-            Err(_) => Verdict::Refused,
+            Err(_) => ReaderDecision::Refused,
         }
     },
 };
 
 pub(super) const SUITE: Target = Target {
     name: "suite_file",
-    reads: "evaluation suites, with the shipped course files to name",
+    reads: "evaluation suites that may name the shipped course files",
     longest_bytes: 4096,
     weight: USUAL / 20,
     samples: suite_samples,
@@ -71,21 +73,21 @@ pub(super) const SUITE: Target = Target {
         match text(bytes).map(|text| Suite::parse(text, &file)) {
             Some(Ok(suite)) => {
                 for entry in &suite.entries {
-                    assert!(entry.flights > 0);
-                    for flight in [0, entry.flights - 1] {
-                        // A range may hold what fits for one seed and nothing for another.
-                        if let Ok(course) = entry.courses.of_flight(flight) {
+                    assert!(entry.episodes > 0);
+                    for episode in [0, entry.episodes - 1] {
+                        // A range may suit one seed but not another.
+                        if let Ok(course) = entry.courses.of_episode(episode) {
                             assert!(course.levels() > 0);
                         }
                     }
                 }
-                Verdict::Accepted
+                ReaderDecision::Accepted
             }
             Some(Err(error)) => {
                 assert!(error.to_string().contains("fuzzed.toml"), "{error}");
-                Verdict::Refused
+                ReaderDecision::Refused
             }
-            None => Verdict::Refused,
+            None => ReaderDecision::Refused,
         }
     },
 };
@@ -93,17 +95,24 @@ pub(super) const SUITE: Target = Target {
 fn suite_samples() -> Vec<Vec<u8>> {
     vec![
         shipped("configs/evaluations/generalist.toml"),
-        b"name = \"x\"\n[[entry]]\nname = \"one\"\nflights = 3\nfirst_seed = 18446744073709551615\n[entry.generated]\nshapes = [\"star\"]\n".to_vec(),
+        b"name = \"x\"\n[[entry]]\nname = \"one\"\nepisodes = 3\nfirst_seed = \
+          18446744073709551615\n[entry.generated]\nshapes = [\"star\"]\n"
+            .to_vec(),
     ]
 }
 
 fn file_samples() -> Vec<Vec<u8>> {
-    ["training", "rearranged_34125", "rearranged_53412", "non_rectangular"]
-        .map(|name| shipped(&format!("configs/courses/{name}.toml")))
-        .to_vec()
+    [
+        "training",
+        "rearranged_34125",
+        "rearranged_53412",
+        "non_rectangular",
+    ]
+    .map(|name| shipped(&format!("configs/courses/{name}.toml")))
+    .to_vec()
 }
 
-/// Scripts whose choices are all in the middle of what is usual, or drawn.
+/// Returns scripts whose choices are all average, or random.
 fn layout_samples() -> Vec<Vec<u8>> {
     let mut samples = vec![[128; 60].to_vec()];
     samples.extend((0..24_u8).map(|seed| {
@@ -118,14 +127,15 @@ fn layout_samples() -> Vec<Vec<u8>> {
     samples
 }
 
-/// One to four walls, each of one of three shapes, in the middle of all ranges.
+/// Returns scripts for one to four walls, each with one of three shapes, in the middle of all
+/// ranges.
 fn generator_samples() -> Vec<Vec<u8>> {
     let numbers = |count: usize| vec![128; 3 * count];
     (1..5_u8)
         .map(|walls| {
             let seed = [walls; 8];
             let shapes = [3, walls, walls + 1, walls + 2];
-            // Before the walls: two ranges, corridor, start, gap; then the thickness and a place for each.
+            // First two ranges, corridor, start and gap; then thickness and position of each wall.
             [
                 &seed[..],
                 &numbers(11),
@@ -138,38 +148,56 @@ fn generator_samples() -> Vec<Vec<u8>> {
         .collect()
 }
 
-/// Flies the first step from the first and the last level: nothing panics, every number is finite, and a flight does not begin in a wall.
-pub(super) fn assert_flyable(course: Course) -> Verdict {
+/// Flies the first step from the first and the last level. No step panics, every number is finite,
+/// and no episode begins in a wall.
+pub(super) fn assert_flyable(course: Course) -> ReaderDecision {
     let settings = SimulatorSettings::default();
     let levels = course.levels();
     let mut simulator = Simulator::new(Arc::new(course), &settings).unwrap();
     fly(&mut simulator, &settings, 1);
     fly(&mut simulator, &settings, levels);
-    Verdict::Accepted
+    ReaderDecision::Accepted
 }
 
 /// Flies two steps from `level`.
 pub(super) fn fly(simulator: &mut Simulator, settings: &SimulatorSettings, level: u8) {
     let [mut start, mut disturbances] = [1, 2].map(Pcg64Mcg::seed_from_u64);
-    simulator.reset(level, &mut start, &mut disturbances).unwrap();
+    simulator
+        .reset(level, &mut start, &mut disturbances)
+        .unwrap();
     let mut image = [0; IMAGE_PIXELS];
     for action in [[0.0, 0.0], [1.0, -1.0]] {
         simulator.render(&mut image);
         let report = simulator.step(action).unwrap();
         let state = simulator.state();
-        let numbers = [state.position_m.coords, state.velocity_mps, state.body_rates_radps];
-        assert!(numbers.iter().flatten().all(|value| value.is_finite()), "{state:?}");
+        let numbers = [
+            state.position_m.coords,
+            state.velocity_mps,
+            state.body_rates_radps,
+        ];
         assert!(
-            state.world_from_body.coords.iter().all(|value| value.is_finite()),
+            numbers.iter().flatten().all(|value| value.is_finite()),
+            "{state:?}"
+        );
+        assert!(
+            state
+                .world_from_body
+                .coords
+                .iter()
+                .all(|value| value.is_finite()),
             "{state:?}"
         );
         simulator.render(&mut image);
         let reward = RewardTerms::of(&settings.reward, &report, &image);
         assert!(reward.total().is_finite(), "{reward:?}");
         if report.outcome.is_some() {
-            // At the slow default speed, half a second from the start there is nothing to touch.
+            // Half a second from the start, at the slow default speed, nothing can be hit.
             let defaults = settings.vehicle == SimulatorSettings::default().vehicle;
-            assert!(!defaults || action != [0.0, 0.0] || report.outcome != Some(Outcome::Collided));
+            assert!(
+                !defaults
+                    || action != [0.0, 0.0]
+                    || report.outcome != Some(EpisodeOutcome::Collided)
+            );
             break;
         }
     }
@@ -224,7 +252,9 @@ fn shape(script: &mut Script<'_>) -> Shape {
     let (width_m, height_m) = (length_m(), length_m());
     match kind {
         0 => Shape::Rectangle { width_m, height_m },
-        1 => Shape::Circle { diameter_m: width_m },
+        1 => Shape::Circle {
+            diameter_m: width_m,
+        },
         2 => Shape::Triangle { width_m, height_m },
         3 => Shape::Diamond { width_m, height_m },
         4 => Shape::Cross {
@@ -241,7 +271,8 @@ fn shape(script: &mut Script<'_>) -> Shape {
     }
 }
 
-/// Corners around the centre or anywhere: some polygons are simple, some are not, some have corners on top of each other.
+/// Returns corners around the centre or anywhere. Some polygons are simple, some are not, some have
+/// coinciding corners.
 fn polygon(script: &mut Script<'_>) -> Shape {
     let corners = script.u8() % 80;
     let round = script.u8() < 192;
@@ -260,7 +291,8 @@ fn polygon(script: &mut Script<'_>) -> Shape {
 }
 
 fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
-    let mut range = |usual: std::ops::RangeInclusive<f32>| [script.number(usual.clone()), script.number(usual)];
+    let mut range =
+        |usual: std::ops::RangeInclusive<f32>| [script.number(usual.clone()), script.number(usual)];
     let (clearance_m, rotation_deg) = (range(0.6..=1.3), range(-360.0..=360.0));
     let (corridor, start) = (corridor(script), start(script));
     let gap_m = script.number(5.0..=20.0);

@@ -1,4 +1,4 @@
-//! What reads bytes from outside, one module a subject.
+//! Readers of outside bytes, one module per subject.
 
 mod checkpoints;
 mod configuration;
@@ -15,31 +15,32 @@ use crate::allocations;
 /// A reader of outside bytes.
 #[derive(Debug)]
 pub struct Target {
-    /// Its name, and that of its folder in the corpus.
+    /// Its name, also that of its folder in the corpus.
     pub name: &'static str,
-    /// What it reads, for who chooses one.
+    /// Description of what it reads.
     pub reads: &'static str,
-    /// Inputs longer than this show nothing that shorter ones do not.
+    /// Length beyond which inputs add nothing new.
     pub longest_bytes: usize,
-    /// Its part in a number of executions over all targets: slow ones get fewer.
+    /// Relative share of executions among all targets: slow ones get fewer.
     pub weight: usize,
-    /// Valid inputs, made by the code that writes them or from what is shipped: no format has to be kept in step by hand.
+    /// Valid inputs, made by the code that writes them or from shipped files, so that no format is
+    /// maintained by hand.
     pub samples: fn() -> Vec<Vec<u8>>,
-    /// Reads the input; panics when a promise is broken.
-    pub run: fn(&[u8]) -> Verdict,
+    /// Reads the input; panics if a guarantee is violated.
+    pub run: fn(&[u8]) -> ReaderDecision,
 }
 
-/// What the reader thought of an input. A target of which nothing is ever accepted would try no promise.
+/// Decision of a reader on an input. A target that never accepts anything would test no guarantee.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
-    /// Something of it was believed.
+pub enum ReaderDecision {
+    /// At least a part was accepted.
     Accepted,
-    /// Nothing was.
+    /// Nothing was accepted.
     Refused,
 }
 
-impl Verdict {
-    /// Accepted if there is a result, and refused if there is none.
+impl ReaderDecision {
+    /// Returns `Accepted` for a result, and `Refused` for `None`.
     fn of<T>(result: Option<T>) -> Self {
         match result {
             Some(_) => Self::Accepted,
@@ -52,8 +53,8 @@ impl Target {
     /// Reads `bytes`.
     ///
     /// # Panics
-    /// When the reader does, breaks a promise, or allocates without bounds.
-    pub fn exercise(&self, bytes: &[u8]) -> Verdict {
+    /// Panics if the reader panics, violates a guarantee, or allocates too much.
+    pub fn exercise(&self, bytes: &[u8]) -> ReaderDecision {
         allocations::forget();
         let verdict = (self.run)(bytes);
         allocations::check();
@@ -61,10 +62,10 @@ impl Target {
     }
 }
 
-/// Weight of a target that reads thousands of inputs a second.
+/// Weight of a target that reads thousands of inputs per second.
 const USUAL: usize = 200;
 
-/// All of them.
+/// All targets.
 pub static TARGETS: [Target; 23] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
@@ -80,7 +81,7 @@ pub static TARGETS: [Target; 23] = [
     snapshots::RECEIVED,
     checkpoints::FILES,
     replay::REPLAY,
-    checkpoints::FLIGHTS_CSV,
+    checkpoints::EPISODES_CSV,
     checkpoints::EVENT_FILES,
     runs::IDENTITY,
     runs::ANNOUNCEMENT,
@@ -91,18 +92,19 @@ pub static TARGETS: [Target; 23] = [
     reports::CURVES,
 ];
 
-/// A file of the repository, by its path from the root.
+/// Returns a file of the repository, by its path from the root.
 fn shipped(path: &str) -> Vec<u8> {
     let root = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
     std::fs::read(format!("{root}/{path}")).unwrap()
 }
 
-/// `content` after a byte that says what it is.
+/// Returns `content` after a byte that selects its kind.
 fn tagged(kind: u8, content: &[u8]) -> Vec<u8> {
     [&[kind], content].concat()
 }
 
-/// The input as text; what is not UTF-8 is refused by whoever opens a file, before any reader of ours sees it.
+/// Returns the input as text. Other bytes are refused when a file is opened, before any reader of
+/// Skein sees them.
 fn text(bytes: &[u8]) -> Option<&str> {
     std::str::from_utf8(bytes).ok()
 }

@@ -1,31 +1,32 @@
-//! What plots are drawn from: `flights.csv`, `evaluation_paths.csv`, and the images beside their reconstructions.
+//! Inputs of plots: `episodes.csv`, `evaluation_trajectories.csv`, and images with their
+//! reconstructions.
 
 use std::sync::LazyLock;
 
-use skein_launch::inspection::read_curves;
-use skein_launch::prepare::NamedCourse;
-use skein_launch::reports::{Material, draw_all};
-use skein_protocol::run::RunDirectory;
+use skein_chaos::read_curves;
+use skein_reports::{NamedCourse, RunMaterial, draw_all};
+use skein_run::{RunDirectory, write_event_record};
 use skein_simulator::course::{Course, CourseLayout};
 
 use super::courses::layout;
-use super::{Target, USUAL, Verdict, shipped, tagged};
+use super::{ReaderDecision, Target, USUAL, shipped, tagged};
 use crate::scratch::with_files;
 use crate::script::Script;
 
 pub(super) const FILES: Target = Target {
     name: "report_files",
-    reads: "flights.csv (after a 0), evaluation_paths.csv (after a 1), reconstructions.safetensors (after a 2)",
+    reads: "episodes.csv (after a 0), evaluation_trajectories.csv (after a 1), \
+            reconstructions.safetensors (after a 2)",
     longest_bytes: 4096,
     weight: USUAL / 2,
     samples,
     run: |bytes| {
-        with_run(bytes, |run| match Material::read(run) {
-            Ok(_) => Verdict::Accepted,
-            Err(error) => {
+        with_run(bytes, |run| match RunMaterial::read(run).1.first() {
+            None => ReaderDecision::Accepted,
+            Some(error) => {
                 let folder = run.root().display().to_string();
                 assert!(error.to_string().contains(&folder), "{error}");
-                Verdict::Refused
+                ReaderDecision::Refused
             }
         })
     },
@@ -33,38 +34,40 @@ pub(super) const FILES: Target = Target {
 
 pub(super) const CURVES: Target = Target {
     name: "curves",
-    reads: "TensorBoard event files: the messages, a line each, in sound frames; after a byte above 127 the file as it is",
+    reads: "TensorBoard event files: messages, one per line, in valid frames; \
+            after a byte above 127 the whole file",
     longest_bytes: 1024,
     weight: USUAL / 2,
     samples: curve_samples,
     run: |bytes| {
         let file = match bytes.split_first() {
             Some((128.., file)) => file.to_vec(),
-            _ => bytes.split(|byte| *byte == b'\n').flat_map(framed).collect(),
+            _ => bytes
+                .split(|byte| *byte == b'\n')
+                .flat_map(framed)
+                .collect(),
         };
         with_files(&[("events.out.tfevents.1", &file)], |folder| {
             if let Err(error) = read_curves(folder) {
-                assert!(error.to_string().contains("events.out.tfevents.1"), "{error}");
-                return Verdict::Refused;
+                assert!(
+                    error.to_string().contains("events.out.tfevents.1"),
+                    "{error}"
+                );
+                return ReaderDecision::Refused;
             }
-            Verdict::Accepted
+            ReaderDecision::Accepted
         })
     },
 };
 
-/// One message as it stands in an event file: length, masked CRC-32C of the length, message, masked CRC-32C of the message.
+/// Returns a message as one record of an event file.
 fn framed(message: &[u8]) -> Vec<u8> {
-    let length = (message.len() as u64).to_le_bytes();
-    let masked = |bytes: &[u8]| {
-        crc32c::crc32c(bytes)
-            .rotate_right(15)
-            .wrapping_add(0xa282_ead8)
-            .to_le_bytes()
-    };
-    [&length[..], &masked(&length), message, &masked(message)].concat()
+    let mut record = Vec::new();
+    write_event_record(&mut record, message).expect("a vector takes all bytes");
+    record
 }
 
-/// A step and two values; the same whole, with its frame.
+/// Returns a step with two values, bare and as a complete file with its frame.
 fn curve_samples() -> Vec<Vec<u8>> {
     let value = |tag: &[u8]| {
         [
@@ -79,18 +82,22 @@ fn curve_samples() -> Vec<Vec<u8>> {
     let read = with_files(&[("events.out.tfevents.1", &framed(&message))], |folder| {
         read_curves(folder).unwrap()
     });
-    assert_eq!(read["return"][&7], [1.5], "the sample is an event of another version");
+    assert_eq!(
+        read["return"][&7],
+        [1.5],
+        "the sample is an event of another version"
+    );
     vec![message.clone(), tagged(128, &framed(&message))]
 }
 
 pub(super) const PICTURES: Target = Target {
     name: "report_pictures",
-    reads: "the same, and draws what is accepted, beside courses of any geometry",
+    reads: "the same files; draws what is accepted, with courses of any geometry",
     longest_bytes: 2048,
     weight: 1,
     samples,
     run: |bytes| {
-        // What follows a zero byte spells a course.
+        // The bytes after a zero byte describe a course.
         let (files, course) = bytes.split_at(
             bytes
                 .iter()
@@ -101,9 +108,9 @@ pub(super) const PICTURES: Target = Target {
         let mut courses = vec![TRAINING.clone()];
         courses.extend(fuzzed_course(course));
         with_run(files, |run| {
-            let pictures = draw_all(run, &courses, 50, 3.0).ok();
-            assert!(pictures.iter().flatten().all(|picture| picture.exists()));
-            Verdict::of(pictures)
+            let plots = draw_all(run, &courses, 50, Some(3.0));
+            assert!(plots.pictures.iter().all(|picture| picture.exists()));
+            ReaderDecision::of(plots.failures.is_empty().then_some(()))
         })
     },
 };
@@ -124,26 +131,35 @@ fn fuzzed_course(script: &[u8]) -> Option<NamedCourse> {
     })
 }
 
-/// A run that left one file, of the kind that the first byte says.
-fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> Verdict) -> Verdict {
-    const NAMES: [&str; 3] = ["flights.csv", "evaluation_paths.csv", "reconstructions.safetensors"];
+/// Creates a run that left one file, of the kind selected by the first byte.
+fn with_run(bytes: &[u8], read: impl FnOnce(&RunDirectory) -> ReaderDecision) -> ReaderDecision {
+    const NAMES: [&str; 3] = [
+        "episodes.csv",
+        "evaluation_trajectories.csv",
+        "reconstructions.safetensors",
+    ];
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = NAMES[usize::from(kind) % NAMES.len()];
-    with_files(&[(name, content)], |folder| read(&RunDirectory::new(folder)))
+    with_files(&[(name, content)], |folder| {
+        read(&RunDirectory::new(folder))
+    })
 }
 
 fn samples() -> Vec<Vec<u8>> {
-    let flights = "flight,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
+    let episodes = "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n\
                    0,0,0,0,1,12,0,-0.9,collided\n1,0,0,1,1,33,1,0.2,timed_out\n";
-    let paths = "course,flight,step,x_m,y_m,z_m,outcome\n\
-                 training,0,0,1.5,0,3,collided\ntraining,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
-    // Empty images: a header is what there is to damage.
-    let images = r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#;
+    let paths = "course,episode,step,x_m,y_m,z_m,outcome\ntraining,0,0,1.5,0,3,collided\n\
+                 training,0,1,9.7,1,3,collided\nfuzzed,1,0,1.5,0.5,3.5,reached_end\n";
+    // Empty images: only the header can be damaged.
+    let images = concat!(
+        r#"{"depth":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]},"#,
+        r#""reconstruction":{"dtype":"U8","shape":[0,72,128],"data_offsets":[0,0]}}"#
+    );
     let images = [&(images.len() as u64).to_le_bytes()[..], images.as_bytes()].concat();
     vec![
-        tagged(0, flights.as_bytes()),
+        tagged(0, episodes.as_bytes()),
         tagged(1, paths.as_bytes()),
         tagged(2, &images),
         [&tagged(1, paths.as_bytes())[..], &[0], &[128; 60]].concat(),

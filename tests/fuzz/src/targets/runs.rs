@@ -1,20 +1,21 @@
-//! What lies in a run's directory besides configuration and snapshots, and what its learner says on standard output.
+//! Files in a run's directory besides configuration and snapshots, and standard output of its
+//! learner.
 
 use std::sync::LazyLock;
 
 use skein_launch::conclusion::conclusion;
-use skein_launch::display::Display;
+use skein_launch::display::ProgressDisplay;
 use skein_launch::supervisor::Restarts;
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
-use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, FlightScore};
+use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
-use skein_protocol::progress::Progress;
-use skein_protocol::run::{Announcement, Life, RunDirectory, RunIdentity};
+use skein_protocol::progress::ProgressReport;
 use skein_protocol::summary::Summary;
 use skein_protocol::transition::Outcome;
+use skein_run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 
-use super::{Target, USUAL, Verdict, tagged};
+use super::{ReaderDecision, Target, USUAL, tagged};
 use crate::scratch::with_files;
 
 pub(super) const IDENTITY: Target = Target {
@@ -28,30 +29,34 @@ pub(super) const IDENTITY: Target = Target {
 
 pub(super) const ANNOUNCEMENT: Target = Target {
     name: "announcement",
-    reads: "what a learner announces of its present life",
+    reads: "the learner's announcement of its present incarnation",
     longest_bytes: 1024,
     weight: USUAL,
     samples: || {
-        let life: Life = serde_json::from_str("7").unwrap();
+        let incarnation: LearnerIncarnation = serde_json::from_str("7").unwrap();
         let (identity, config) = opened();
-        vec![serde_json::to_vec(&Announcement::new(&identity, life, &config)).unwrap()]
+        vec![serde_json::to_vec(&Announcement::new(&identity, incarnation, &config)).unwrap()]
     },
     run: |bytes| {
         let read = serde_json::from_slice::<Announcement>(bytes).ok();
-        let joined = read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
+        let joined =
+            read.filter(|announcement| announcement.check(&IDENTIFIED.0, &IDENTIFIED.1).is_ok());
         if let Some(announcement) = &joined {
-            // Life and process are the learner's to choose; in all else it is what we would say.
-            let mut mine = Announcement::new(&IDENTIFIED.0, announcement.life, &IDENTIFIED.1);
+            // The learner chooses incarnation and process id; all else must equal what this code
+            // would write.
+            let mut mine =
+                Announcement::new(&IDENTIFIED.0, announcement.incarnation, &IDENTIFIED.1);
             mine.pid = announcement.pid;
             assert_eq!(announcement, &mine);
         }
-        Verdict::of(joined)
+        ReaderDecision::of(joined)
     },
 };
 
 pub(super) const RESULTS: Target = Target {
     name: "results",
-    reads: "evaluation.json (after a 0) and summary.json (after a 1), as a run's conclusion reads them",
+    reads: "evaluation.json (after a 0) and summary.json (after a 1), as read by a run's \
+            conclusion",
     longest_bytes: 4096,
     weight: USUAL,
     samples: result_samples,
@@ -60,7 +65,7 @@ pub(super) const RESULTS: Target = Target {
 
 pub(super) const PROGRESS: Target = Target {
     name: "progress",
-    reads: "what a learner says on standard output, line by line, as it is shown",
+    reads: "standard output of a learner, line by line, as it is shown",
     longest_bytes: 4096,
     weight: USUAL,
     samples: progress_samples,
@@ -85,27 +90,30 @@ fn opened() -> (RunIdentity, Config) {
     .unwrap()
 }
 
-fn identity(bytes: &[u8]) -> Verdict {
+fn identity(bytes: &[u8]) -> ReaderDecision {
     with_files(
         &[("run.json", bytes), ("config.toml", &RUN.1)],
         |folder| match RunDirectory::new(folder).open() {
             Ok((identity, config)) => {
                 assert_eq!(identity.protocol_version, PROTOCOL_VERSION);
                 assert_eq!(identity.config_digest, config.digest());
-                Verdict::Accepted
+                ReaderDecision::Accepted
             }
             Err(error) => {
-                assert!(error.to_string().contains(&folder.display().to_string()), "{error}");
-                Verdict::Refused
+                assert!(
+                    error.to_string().contains(&folder.display().to_string()),
+                    "{error}"
+                );
+                ReaderDecision::Refused
             }
         },
     )
 }
 
 fn result_samples() -> Vec<Vec<u8>> {
-    let scores = [FlightScore {
+    let scores = [EpisodeScore {
         walls_passed: 3,
-        flight_return: -1.5,
+        episode_return: -1.5,
         outcome: Outcome::Collided,
         hit_wall: Some(4),
     }; 4];
@@ -114,19 +122,28 @@ fn result_samples() -> Vec<Vec<u8>> {
         policy_sha256: "1024266715d59141".to_owned(),
         courses: vec![CourseEvaluation::of("training", 5, &scores)],
     };
-    // Read, not made: it has fields for whatever a run may come to, and a reader that knows fewer of them reads it too.
-    let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed","policy_sha256":"1024266715d59141","final_version":80,
-        "best_version":70,"best_confirmed_walls_passed":4.9,"flights":800,"steps":42837,"updates":20418,"vae_updates":400,
-        "evaluation_flights":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
-        "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},{"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
+    // Constant rather than generated: it lists all possible fields, and a reader that knows fewer
+    // of them must read it too.
+    let summary = r#"{"skein_version":"0.1.0","run":7,"seed":1,"ending":"completed",
+        "policy_sha256":"1024266715d59141",
+        "final_version":80,
+        "best_version":70,"best_confirmed_walls_passed":4.9,
+        "episodes":800,"steps":42837,"updates":20418,
+        "vae_updates":400,
+        "evaluation_episodes":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
+        "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},
+            {"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
     let read: Summary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
-    vec![tagged(0, &serde_json::to_vec(&report).unwrap()), tagged(1, &written)]
+    vec![
+        tagged(0, &serde_json::to_vec(&report).unwrap()),
+        tagged(1, &written),
+    ]
 }
 
-fn results(bytes: &[u8]) -> Verdict {
+fn results(bytes: &[u8]) -> ReaderDecision {
     let Some((&kind, content)) = bytes.split_first() else {
-        return Verdict::Refused;
+        return ReaderDecision::Refused;
     };
     let name = if kind % 2 == 0 {
         "evaluation.json"
@@ -134,20 +151,27 @@ fn results(bytes: &[u8]) -> Verdict {
         "summary.json"
     };
     with_files(&[(name, content)], |folder| {
-        let told = conclusion(&RunDirectory::new(folder));
-        assert!(told.contains(name), "{told}");
-        // What cannot be read is left out.
+        let text = conclusion(&RunDirectory::new(folder), 80);
+        assert!(text.contains(name), "{text}");
+        // Invalid files are left out.
         let shown = ["Best snapshot (", "Final policy ("]
             .into_iter()
-            .find(|words| told.contains(words));
-        Verdict::of(shown)
+            .find(|words| text.contains(words));
+        ReaderDecision::of(shown)
     })
 }
 
 fn progress_samples() -> Vec<Vec<u8>> {
-    let line = |phase: &str, flights: u64, secs: f64| {
+    let line = |phase: &str, episodes: u64, secs: f64| {
         format!(
-            r#"{{"phase":"{phase}","flights":{flights},"total_flights":2000,"evaluation_flights":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"elapsed_secs":{secs}}}"#
+            concat!(
+                r#"{{"phase":"{}","episodes":{},"total_episodes":2000,"#,
+                r#""evaluation_episodes":[0,20],"steps":10000,"updates":4000,"vae_updates":100,"#,
+                r#""steps_per_sec":151.6,"updates_per_sec":63.2,"walls_passed":1.25,"#,
+                r#""mean_return":null,"temperature":0.05,"vae_loss":50.1,"actors":2,"#,
+                r#""elapsed_secs":{}}}"#
+            ),
+            phase, episodes, secs
         )
     };
     let lines = [
@@ -159,19 +183,22 @@ fn progress_samples() -> Vec<Vec<u8>> {
     let sample = lines.join("\n").into_bytes();
     let understood = sample
         .split(|byte| *byte == b'\n')
-        .all(|line| serde_json::from_slice::<Progress>(line).is_ok());
-    assert!(understood, "the samples are the progress of another version");
+        .all(|line| serde_json::from_slice::<ProgressReport>(line).is_ok());
+    assert!(
+        understood,
+        "the samples are progress lines of another version"
+    );
     vec![sample]
 }
 
-fn progress(bytes: &[u8]) -> Verdict {
-    let mut display = Display::new();
-    let mut verdict = Verdict::Refused;
+fn progress(bytes: &[u8]) -> ReaderDecision {
+    let mut display = ProgressDisplay::new();
+    let mut verdict = ReaderDecision::Refused;
     for line in bytes.split(|byte| *byte == b'\n') {
-        if let Ok(progress) = serde_json::from_slice::<Progress>(line) {
+        if let Ok(progress) = serde_json::from_slice::<ProgressReport>(line) {
             let (head, figures) = display.text(&progress, Restarts::default());
             assert!(!head.is_empty() && !figures.is_empty());
-            verdict = Verdict::Accepted;
+            verdict = ReaderDecision::Accepted;
         }
     }
     verdict

@@ -1,4 +1,5 @@
-//! Snapshots, from a file and off the wire. A sound one is 3 MB of parameters; inputs change some of them, the header, and the length.
+//! Snapshots, from a file and off the wire. A valid one is 3 MB of parameters; inputs change some
+//! of them, the header, and the length.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -10,12 +11,12 @@ use skein_protocol::ids::{PolicyVersion, RunId};
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 
 use super::signals::pod;
-use super::{Target, USUAL, Verdict};
+use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
     name: "snapshot_file",
-    reads: "snapshot files: the safetensors header and metadata, before sound parameters",
+    reads: "snapshot files: the safetensors header and metadata, before valid parameters",
     longest_bytes: 1 << 14,
     weight: USUAL,
     samples: || vec![SOUND.header.clone()],
@@ -24,7 +25,7 @@ pub(super) const FILE: Target = Target {
 
 pub(super) const RECEIVED: Target = Target {
     name: "snapshot_received",
-    reads: "snapshots off the wire: header, then changes to a sound one's bytes",
+    reads: "snapshots off the wire: header, then changes to a valid one's bytes",
     longest_bytes: 256,
     weight: USUAL / 4,
     samples: received_samples,
@@ -33,29 +34,28 @@ pub(super) const RECEIVED: Target = Target {
 
 const RUN: RunId = RunId(1);
 
-/// The file of a small policy's snapshot, cut in two.
-struct Sound {
+/// The file of a small policy's snapshot, in two parts.
+struct ValidSnapshot {
     layout: SnapshotLayout,
     snapshot: Snapshot,
-    /// With its length before it.
+    /// Header with its length before it.
     header: Vec<u8>,
     values: Vec<u8>,
 }
 
-static SOUND: LazyLock<Sound> = LazyLock::new(|| {
+static SOUND: LazyLock<ValidSnapshot> = LazyLock::new(|| {
     let mut config = Config::default();
     config.sac.hidden_width = 1;
     let layout = SnapshotLayout::of(&config);
     let snapshot = Snapshot {
         version: PolicyVersion(3),
-        values: (0..layout.values()).map(|index| (index as f32).sin()).collect(),
+        values: (0..layout.values())
+            .map(|index| (index as f32).sin())
+            .collect(),
     };
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("sound.safetensors");
-    snapshot.save(&path, &layout, &config).unwrap();
-    let mut header = std::fs::read(path).unwrap();
+    let mut header = snapshot.to_file(&layout, &config);
     let values = header.split_off(header.len() - layout.values() * size_of::<f32>());
-    Sound {
+    ValidSnapshot {
         layout,
         snapshot,
         header,
@@ -64,21 +64,25 @@ static SOUND: LazyLock<Sound> = LazyLock::new(|| {
 });
 
 thread_local! {
-    /// A sound snapshot's values after room for a header, so that 3 MB need not be copied for each input.
-    static BUFFER: RefCell<Vec<u8>> = RefCell::new([vec![0; FILE.longest_bytes], SOUND.values.clone()].concat());
+    /// Values of a valid snapshot after room for a header, so that 3 MB need not be copied per
+    /// input.
+    static BUFFER: RefCell<Vec<u8>> = RefCell::new(
+        [vec![0; FILE.longest_bytes], SOUND.values.clone()].concat(),
+    );
 }
 
-/// The input's first eight bytes are the length of the file's header; the sound one's is right if the rest is as long.
-fn file(bytes: &[u8]) -> Verdict {
+/// Parses a file. The input's first eight bytes are the length of the header; that of the valid one
+/// is right if the rest has the same length.
+fn file(bytes: &[u8]) -> ReaderDecision {
     BUFFER.with_borrow_mut(|buffer| {
         let start = FILE.longest_bytes - bytes.len();
         buffer[start..FILE.longest_bytes].copy_from_slice(bytes);
-        // A header of the length that it states is the only one that is read at all.
+        // Only a header with the stated length is read at all.
         if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
             *length = (bytes.len() as u64 - 8).to_le_bytes();
         }
-        let sound =
-            [&buffer[start..], bytes].map(|file| match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
+        let sound = [&buffer[start..], bytes].map(|file| {
+            match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
                 Ok((snapshot, config)) => {
                     check(&snapshot, &SnapshotLayout::of(&config));
                     Some(snapshot)
@@ -87,8 +91,9 @@ fn file(bytes: &[u8]) -> Verdict {
                     assert!(error.to_string().contains("fuzzed.safetensors"), "{error}");
                     None
                 }
-            });
-        Verdict::of(sound.into_iter().flatten().next())
+            }
+        });
+        ReaderDecision::of(sound.into_iter().flatten().next())
     })
 }
 
@@ -97,7 +102,8 @@ fn check(snapshot: &Snapshot, layout: &SnapshotLayout) {
     assert!(snapshot.values.iter().all(|value| value.is_finite()));
 }
 
-/// A header, whether the checksum is made right, bytes cut off, and triples of a place and what is written there.
+/// Returns inputs: a header, a flag for a correct checksum, a number of bytes cut off, and changes
+/// (position and value).
 fn received_samples() -> Vec<Vec<u8>> {
     let header = SOUND.snapshot.header(RUN, &SOUND.layout);
     let sample = |script: &[u8]| [bytes_of(&header), script].concat();
@@ -109,7 +115,7 @@ fn received_samples() -> Vec<Vec<u8>> {
     ]
 }
 
-fn received(bytes: &[u8]) -> Verdict {
+fn received(bytes: &[u8]) -> ReaderDecision {
     let mut script = Script::new(bytes);
     let mut header: SnapshotHeader = pod(script.bytes(size_of::<SnapshotHeader>()));
     let checksum_is_made_right = script.u8() % 2 == 1;
@@ -132,10 +138,10 @@ fn received(bytes: &[u8]) -> Verdict {
             assert_eq!(cast_slice::<f32, u8>(&snapshot.values), sent);
             assert_eq!(snapshot.version.0, header.policy_version);
         }
-        // Backwards: a place that was changed twice gets its first value back.
+        // In reverse, so that a position that was changed twice gets its first value back.
         for (place, value) in changed.into_iter().rev() {
             values[place] = value;
         }
-        Verdict::of(read)
+        ReaderDecision::of(read)
     })
 }

@@ -1,3 +1,5 @@
+//! Course files: what they accept, and the errors that name wall, key and line.
+
 use super::*;
 
 const GOOD: &str = r#"
@@ -38,7 +40,10 @@ fn refusal(from: &str, to: &str) -> String {
 #[track_caller]
 fn assert_says(message: &str, parts: &[&str]) {
     assert!(message.starts_with("configs/courses/x.toml: "), "{message}");
-    assert!(!message.contains('\n'), "{message:?} has more than one line");
+    assert!(
+        !message.contains('\n'),
+        "{message:?} has more than one line"
+    );
     for part in parts {
         assert!(message.contains(part), "{part:?} is missing in: {message}");
     }
@@ -47,16 +52,76 @@ fn assert_says(message: &str, parts: &[&str]) {
 #[test]
 fn order_puts_walls_into_the_corridor() {
     let course = Course::parse(GOOD, "x.toml").unwrap();
-    let placed: Vec<_> = course.walls().iter().map(|wall| (wall.label().0, wall.x_m())).collect();
+    let placed: Vec<_> = course
+        .walls()
+        .iter()
+        .map(|wall| (wall.label().0, wall.x_m()))
+        .collect();
     assert_eq!(placed, [(7, 10.0), (4, 20.0)]);
     assert_eq!(course.levels(), 2);
 }
 
 #[test]
+fn a_list_with_too_many_or_too_few_numbers_is_refused() {
+    for (centre, count) in [("[1,5, 4,6]", 4), ("[0, 3.5, 99]", 3), ("[1.5]", 1)] {
+        let message = refusal("centre_m = [-1.0, 4.0]", &format!("centre_m = {centre}"));
+        let problem = format!("has {count} numbers: give 2");
+        assert_says(&message, &["wall 7", "line 23", "key centre_m", &problem]);
+    }
+    let polygon = |points: &str| {
+        let keys = format!("shape = \"polygon\"\npoints_m = {points}");
+        let text = GOOD.replacen("diameter_m = 2.2", "", 1);
+        let text = text.replacen("shape = \"circle\"", &keys, 1);
+        Course::parse(&text, "configs/courses/x.toml")
+    };
+    let error = polygon("[[-1, -1], [1, -1, 5], [0, 1]]").unwrap_err();
+    let parts = ["wall 7", "key points_m", "has 3 numbers"];
+    assert_says(&error.to_string(), &parts);
+    // Tables written as lists, whose further values the parser alone would ignore.
+    let walls = GOOD.find("[[wall]]").unwrap();
+    let text = GOOD[..walls].replace(
+        "[corridor]\nlength_m = 30.0\nwidth_m = 6.0\nheight_m = 7.0\n",
+        "corridor = [30.0, 6.0, 7.0, 9.0]\n",
+    ) + &GOOD[walls..];
+    let error = Course::parse(&text, "configs/courses/x.toml").unwrap_err();
+    assert_says(&error.to_string(), &["corridor"]);
+}
+
+#[test]
+fn a_closed_ring_is_a_polygon_and_a_repeated_corner_is_named() {
+    let with = |points: &str| {
+        let keys = format!("shape = \"polygon\"\npoints_m = {points}");
+        let text = GOOD.replacen("diameter_m = 2.2", "", 1);
+        let text = text.replacen("shape = \"circle\"", &keys, 1);
+        Course::parse(&text, "configs/courses/x.toml")
+    };
+    let open = with("[[-1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2]]").unwrap();
+    let closed = "[[-1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2], [-1.2, -1.2]]";
+    assert_eq!(with(closed).unwrap(), open);
+    let twice = "[[-1.2, -1.2], [1.2, -1.2], [1.2, -1.2], [1.2, 1.2], [-1.2, 1.2]]";
+    let error = with(twice).unwrap_err().to_string();
+    assert_says(&error, &["wall 7", "points_m", "corner 2 twice"]);
+}
+
+#[test]
+fn a_name_that_breaks_a_table_is_refused() {
+    for name in ["two\\nlines", "two | columns"] {
+        let message = refusal("two walls", name);
+        assert_says(&message, &["course: key name", "one line"]);
+    }
+}
+
+#[test]
 fn an_unknown_key_is_named_with_its_wall_and_line() {
     let message = refusal("diameter_m = 2.2", "diameter_m = 2.2\nradius_m = 1.1");
-    assert_says(&message, &["wall 7", "radius_m", "unknown field", "line 25"]);
-    assert_says(&refusal("name =", "nmae = 3\nname ="), &["course", "nmae", "line 2"]);
+    assert_says(
+        &message,
+        &["wall 7", "radius_m", "unknown field", "line 25"],
+    );
+    assert_says(
+        &refusal("name =", "nmae = 3\nname ="),
+        &["course", "nmae", "line 2"],
+    );
 }
 
 #[test]
@@ -74,7 +139,11 @@ fn a_value_of_the_wrong_kind_is_named_with_its_wall_line_and_key() {
         "",
         "course: line 6: key corridor: missing field `length_m`",
     );
-    says("name = \"two walls\"\n", "", "course: line 1: missing field `name`");
+    says(
+        "name = \"two walls\"\n",
+        "",
+        "course: line 1: missing field `name`",
+    );
     says(
         "height_m = 2.5",
         "height_m = 2.5\nheight_m = 2",
@@ -83,24 +152,34 @@ fn a_value_of_the_wrong_kind_is_named_with_its_wall_line_and_key() {
     says(
         "\"rectangle\"",
         "\"oblong\"",
-        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
+        "wall 4: line 16: key shape: unknown variant `oblong`, expected one of `rectangle`, \
+         `circle`, `triangle`, `diamond`, `cross`, `l`, `polygon`",
     );
 }
 
 #[test]
-fn a_file_that_is_no_toml_is_refused_by_wall_line_and_key() {
+fn a_file_that_is_not_toml_is_refused_by_wall_line_and_key() {
     assert_says(
         &refusal("diameter_m = 2.2", "diameter_m = = 2.2"),
         &["wall 7: line 24: key diameter_m: "],
     );
-    assert_says(&refusal("[start]", "[start"), &["course: line 10: key start: "]);
+    assert_says(
+        &refusal("[start]", "[start"),
+        &["course: line 10: key start: "],
+    );
 }
 
 #[test]
-fn keys_are_those_of_the_shape() {
-    assert_says(&refusal("diameter_m = 2.2", ""), &["wall 7", "diameter_m is missing"]);
+fn a_shape_takes_exactly_its_keys() {
+    assert_says(
+        &refusal("diameter_m = 2.2", ""),
+        &["wall 7", "diameter_m is missing"],
+    );
     let foreign = refusal("diameter_m = 2.2", "diameter_m = 2.2\narm_m = 1.0");
-    assert_says(&foreign, &["wall 7", "arm_m does not belong to a circle", "remove it"]);
+    assert_says(
+        &foreign,
+        &["wall 7", "arm_m does not belong to a circle", "remove it"],
+    );
 }
 
 #[test]
@@ -116,7 +195,7 @@ fn an_opening_smaller_than_the_drone_is_refused() {
 }
 
 #[test]
-fn an_opening_over_the_rim_is_refused() {
+fn an_opening_beyond_the_frame_is_refused() {
     assert_says(
         &refusal("[1.0, 3.0]", "[2.0, 3.0]"),
         &["wall 4", "y = 3.00 m", "centre_m"],
@@ -129,10 +208,17 @@ fn an_opening_over_the_rim_is_refused() {
 
 #[test]
 fn a_polygon_that_crosses_itself_is_refused() {
-    let bow_tie = "shape = \"polygon\"\npoints_m = [[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]]\n";
+    let bow_tie =
+        "shape = \"polygon\"\npoints_m = [[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]]\n";
     let text = bow_tie.to_owned() + "centre_m = [0.0, 3.0]";
-    let message = refusal("shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2", &text);
-    assert_says(&message, &["wall 7", "crosses or touches itself (edges 1 and 3)"]);
+    let message = refusal(
+        "shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2",
+        &text,
+    );
+    assert_says(
+        &message,
+        &["wall 7", "crosses or touches itself (edges 1 and 3)"],
+    );
 }
 
 #[test]
@@ -141,20 +227,29 @@ fn walls_too_close_or_outside_are_refused() {
         &refusal("[10.0, 20.0]", "[10.0, 14.0]"),
         &["wall 4", "leaves 2.50 m", "move the wall back"],
     );
-    assert_says(&refusal("[10.0, 20.0]", "[10.0, 29.5]"), &["wall 4", "wall_x_m = 29.5"]);
-    assert_says(&refusal("[10.0, 20.0]", "[20.0, 10.0]"), &["wall 4", "wall_x_m"]);
+    assert_says(
+        &refusal("[10.0, 20.0]", "[10.0, 29.5]"),
+        &["wall 4", "wall_x_m = 29.5"],
+    );
+    assert_says(
+        &refusal("[10.0, 20.0]", "[20.0, 10.0]"),
+        &["wall 4", "wall_x_m"],
+    );
 }
 
 #[test]
 fn order_must_match_walls_and_places() {
     assert_says(&refusal("[7, 4]", "[7, 5]"), &["order names wall 5"]);
     assert_says(&refusal("[7, 4]", "[7, 7]"), &["wall 7", "order"]);
-    assert_says(&refusal("[7, 4]", "[7]"), &["order has 1 walls and wall_x_m 2 places"]);
+    assert_says(
+        &refusal("[7, 4]", "[7]"),
+        &["order has 1 walls and wall_x_m 2 places"],
+    );
     assert_says(&refusal("label = 7", "label = 4"), &["wall 4", "label"]);
 }
 
 #[test]
-fn numbers_that_are_none_are_refused() {
+fn numbers_that_are_not_finite_or_negative_are_refused() {
     for key in ["length_m", "offset_m", "wall_thickness_m", "rotation_deg"] {
         let text = match key {
             "length_m" => GOOD.replace("length_m = 30.0", "length_m = nan"),
@@ -166,5 +261,8 @@ fn numbers_that_are_none_are_refused() {
         assert!(error.contains(key), "{error}");
     }
     assert_says(&refusal("[10.0, 20.0]", "[10.0, nan]"), &["wall 4", "NaN"]);
-    assert_says(&refusal("[-1.0, 4.0]", "[nan, 4.0]"), &["wall 7", "centre_m = NaN"]);
+    assert_says(
+        &refusal("[-1.0, 4.0]", "[nan, 4.0]"),
+        &["wall 7", "centre_m = NaN"],
+    );
 }

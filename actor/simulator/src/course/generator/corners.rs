@@ -1,4 +1,6 @@
-//! Families of openings that are polygons: corners `[y, z]`, counter-clockwise, of any size.
+//! Families of openings that are polygons.
+//!
+//! Each function draws corners `[y, z]`, counter-clockwise and of arbitrary scale.
 
 use std::f32::consts::TAU;
 
@@ -20,12 +22,20 @@ pub(super) fn polygon(rng: &mut impl Rng) -> Shape {
 
 pub(super) fn trapezoid(rng: &mut impl Rng) -> Shape {
     let (upper, height) = (rng.random_range(0.25..=0.4), rng.random_range(0.35..=0.5));
-    let points_m = vec![[-0.5, -height], [0.5, -height], [upper, height], [-upper, height]];
+    let points_m = vec![
+        [-0.5, -height],
+        [0.5, -height],
+        [upper, height],
+        [-upper, height],
+    ];
     Shape::Polygon { points_m }
 }
 
 pub(super) fn t(rng: &mut impl Rng) -> Shape {
-    let (stem, bar) = (rng.random_range(0.225..=0.325), rng.random_range(0.45..=0.65));
+    let (stem, bar) = (
+        rng.random_range(0.225..=0.325),
+        rng.random_range(0.45..=0.65),
+    );
     let under = 0.5 - bar;
     mirrored(&[[stem, -0.5], [stem, under], [0.5, under], [0.5, 0.5]])
 }
@@ -42,7 +52,7 @@ pub(super) fn star(rng: &mut impl Rng) -> Shape {
     Shape::Polygon { points_m }
 }
 
-/// Corners around a centre, bays and points wherever they come to lie.
+/// Corners around a centre, with bays and points at random.
 pub(super) fn blob(rng: &mut impl Rng) -> Shape {
     let corners = rng.random_range(9..=14);
     let points_m = (0..corners)
@@ -52,30 +62,45 @@ pub(super) fn blob(rng: &mut impl Rng) -> Shape {
 }
 
 pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
-    // The slot leaves the head between its last corner and its first, both on the unit circle.
+    // The slot starts between the head's last corner and its first, both on the unit circle.
     let (sides, half_slot) = (rng.random_range(5..=8), rng.random_range(0.065..=0.11));
     let (length, taper) = (rng.random_range(0.8..=1.8), rng.random_range(0.7..=1.1));
     let [neck, edge] = polar(half_slot, 1.0);
     let head = (0..=sides).map(|corner| {
         let share = half_slot + (1.0 - 2.0 * half_slot) * corner as f32 / sides as f32;
         let is_neck = corner == 0 || corner == sides;
-        polar(share, if is_neck { 1.0 } else { rng.random_range(0.85..=1.15) })
+        polar(
+            share,
+            if is_neck {
+                1.0
+            } else {
+                rng.random_range(0.85..=1.15)
+            },
+        )
     });
     let mut points_m: Vec<_> = head.collect();
     points_m.extend([-1.0, 1.0].map(|side| [neck + length, side * taper * edge]));
     Shape::Polygon { points_m }
 }
 
-/// The unit disc without another one beside it: around on its own edge, back on that of the other.
+/// The unit disc without a second one: around on its own edge, back on the edge of the second.
 pub(super) fn crescent(rng: &mut impl Rng) -> Shape {
     const OUTER: usize = 12;
     const INNER: usize = 6;
     let beside: f32 = rng.random_range(0.9..=1.3);
-    // Half of the angle under which either centre sees where the two edges cross.
+    // Half of the angle, seen from either centre, between the points where the two edges cross.
     let crossing = (beside / 2.0).acos() / TAU;
-    let outer = (0..=OUTER).map(|corner| polar(crossing + (1.0 - 2.0 * crossing) * corner as f32 / OUTER as f32, 1.0));
+    let outer = (0..=OUTER).map(|corner| {
+        polar(
+            crossing + (1.0 - 2.0 * crossing) * corner as f32 / OUTER as f32,
+            1.0,
+        )
+    });
     let inner = (1..INNER).map(|corner| {
-        let [y, z] = polar(0.5 + crossing - 2.0 * crossing * corner as f32 / INNER as f32, 1.0);
+        let [y, z] = polar(
+            0.5 + crossing - 2.0 * crossing * corner as f32 / INNER as f32,
+            1.0,
+        );
         [beside + y, z]
     });
     let points_m = outer.chain(inner).collect();
@@ -93,7 +118,7 @@ pub(super) fn u(rng: &mut impl Rng) -> Shape {
     ])
 }
 
-/// The right half of a shape, from the bottom upwards or back to the middle, and its mirror image.
+/// Completes the right half of a shape, from bottom to top, with its mirror image.
 fn mirrored(right: &[[f32; 2]]) -> Shape {
     let left = right.iter().rev().map(|[y, z]| [-y, *z]);
     Shape::Polygon {
@@ -101,7 +126,7 @@ fn mirrored(right: &[[f32; 2]]) -> Shape {
     }
 }
 
-/// The point at `share` of a full turn, `radius` from the centre.
+/// Returns the point at `share` of a full turn, `radius` from the centre.
 fn polar(share: f32, radius: f32) -> [f32; 2] {
     let (sin, cos) = (share * TAU).sin_cos();
     [radius * cos, radius * sin]

@@ -1,0 +1,98 @@
+//! The agent: from camera image to action.
+
+use rand::{Rng, RngExt};
+use skein_protocol::ACTION;
+use skein_protocol::config::ObservationLayout;
+use skein_protocol::stages::Stage;
+use skein_protocol::ticket::Exploration;
+use skein_protocol::transition::TransitionRecord;
+use skein_simulator::simulator::Simulator;
+
+use skein_inference::{Network, Scratch};
+
+/// Working memory of one thread that observes and acts.
+#[derive(Debug)]
+pub struct Agent {
+    layout: ObservationLayout,
+    /// Inputs of the episode's steps so far, `[steps, ObservationLayout::step_len]`.
+    step_inputs: Vec<f32>,
+    /// The policy's input, `[ObservationLayout::len]`.
+    observed: Vec<f32>,
+    scratch: Scratch,
+}
+
+impl Agent {
+    /// Creates an agent whose policy sees `layout`.
+    pub fn new(layout: ObservationLayout) -> Self {
+        Self {
+            step_inputs: Vec::new(),
+            observed: vec![0.0; layout.len()],
+            layout,
+            scratch: Scratch::default(),
+        }
+    }
+
+    /// Renders the camera image into `record` and encodes it there. `lap` is called after each.
+    pub fn observe(
+        &mut self,
+        simulator: &mut Simulator,
+        network: &Network,
+        record: &mut TransitionRecord,
+        mut lap: impl FnMut(Stage),
+    ) {
+        simulator.render(&mut record.depth);
+        lap(Stage::Camera);
+        record.latent = network.encode(&record.depth, &mut self.scratch);
+        let state = simulator.state();
+        record.position_m = state.position_m.coords.into();
+        record.orientation = state.world_from_body.coords.into();
+        record.velocity_mps = state.velocity_mps.into();
+        record.ground_truth = simulator.ground_truth().numbers();
+        lap(Stage::Encoder);
+    }
+
+    /// Chooses an action for the observation in `record`, each command in [-1, 1]. `noise` is used
+    /// unless the policy's mode is asked for. Call it for each step of an episode, in order; step 0
+    /// starts a new episode.
+    pub fn act(
+        &mut self,
+        exploration: Exploration,
+        network: &Network,
+        record: &TransitionRecord,
+        previous_action: &[f32; ACTION],
+        noise: &mut impl Rng,
+    ) -> [f32; ACTION] {
+        self.remember(record, previous_action);
+        let mut distribution = || {
+            let Self {
+                layout,
+                step_inputs,
+                observed,
+                scratch,
+            } = self;
+            let len = layout.step_len();
+            layout.write(record.step as usize, observed, |step, into| {
+                into.copy_from_slice(&step_inputs[step * len..][..len]);
+            });
+            network.distribution(observed, scratch)
+        };
+        match exploration {
+            Exploration::Uniform => std::array::from_fn(|_| noise.random_range(-1.0..=1.0)),
+            Exploration::Sample => distribution().sample(noise),
+            Exploration::Mode => distribution().mode(),
+        }
+    }
+
+    /// Stores the input of the step in `record`, and drops the inputs of earlier episodes.
+    fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
+        let len = self.layout.step_len();
+        let first = record.step as usize * len;
+        self.step_inputs.resize(first + len, 0.0);
+        self.layout.write_step(
+            &record.latent,
+            &record.velocity_mps,
+            previous_action,
+            &mut self.step_inputs[first..],
+        );
+    }
+}

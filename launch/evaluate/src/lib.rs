@@ -1,0 +1,448 @@
+//! Evaluation from the command line: flies a trained snapshot, prints and stores the results.
+//!
+//! `skein-evaluate` and `skein evaluate` share this module.
+
+mod memory;
+mod plot;
+mod settings;
+
+use std::fs::{self, File, OpenOptions};
+use std::num::NonZeroUsize;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::memory::{check_recording, free_memory};
+use crate::settings::with_overrides;
+use anyhow::{Context, bail};
+use clap::{Args, Parser};
+use serde::Serialize;
+use skein_kernels::Isa;
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::snapshot::Snapshot;
+use skein_reports::MOST_DRAWN;
+use skein_rollout::courses::Courses;
+use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
+use skein_rollout::recording::{
+    COLUMNS, NAME_LISTS, check_recordable, temporary_path, write_recording,
+};
+use skein_run::RunDirectory;
+use skein_run::tables::evaluation_table;
+use skein_run::terminal::stdout_columns;
+use skein_run::{note, show};
+use skein_simulator::camera::InstructionSet;
+use skein_simulator::suite::{EntryCourses, MOST_EPISODES, Suite, SuiteEntry};
+
+/// Flies a trained snapshot through courses and prints its results.
+///
+/// Every episode begins at the start of level 1 and follows the policy without noise. The episodes
+/// are the same each time, whatever the number of threads: their seeds derive from the seed of the
+/// run that trained the snapshot. The snapshot file holds that run's configuration.
+///
+/// R is the mean rate of walls passed, (t_1 + … + t_n) / (n · episodes), where t_i counts the
+/// episodes that passed wall i. The table also shows how the other episodes failed: the wall they
+/// hit, or the wall before which they hit the corridor or ran out of steps. Walls are numbered in
+/// the order in which the drone meets them.
+#[derive(Debug, Parser)]
+#[command(name = "skein-evaluate", version, after_long_help = columns_help())]
+pub struct Arguments {
+    #[command(flatten)]
+    subject: Subject,
+    /// A course file to fly; may be repeated. By default the evaluation courses of the run that
+    /// trained the snapshot.
+    #[arg(long, value_name = "FILE")]
+    course: Vec<PathBuf>,
+    /// A suite file to fly instead: courses, all orders of a course's walls, or generated courses,
+    /// each with its own disturbances. Example: configs/evaluations/generalist.toml.
+    #[arg(long, value_name = "FILE", conflicts_with = "course")]
+    suite: Option<PathBuf>,
+    /// Episodes per course or per entry of the suite. By default evaluation.episodes of that run,
+    /// or the suite's number.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_EPISODES))]
+    episodes: Option<u64>,
+    /// Change one setting that the snapshot was trained with, for example
+    /// --set simulator.vehicle.preset=hummingbird; may be repeated.
+    ///
+    /// Keys in [simulator] can be changed, and run.seed, from which the episodes' seeds derive.
+    #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Also write the result to this file, as JSON.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Also write every step of every episode to this file, as .npz. Needs 9.3 KiB of memory per
+    /// step, about 1 MiB per whole episode.
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Also draw the trajectories to this file, as PNG: each course from above and from the side,
+    /// and its walls from the front. Of an entry with several courses, the first is drawn.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    // Not a doc comment, which cannot contain the constant.
+    #[arg(long, value_name = "N", help = threads_help())]
+    threads: Option<NonZeroUsize>,
+}
+
+/// Snapshot to fly.
+#[derive(Debug, Args)]
+#[group(required = true, multiple = false)]
+struct Subject {
+    /// Directory of a run: flies its best snapshot, or its latest if none has been confirmed as
+    /// best.
+    #[arg(long, value_name = "DIR")]
+    run: Option<PathBuf>,
+    /// A snapshot file (.safetensors).
+    #[arg(long, value_name = "FILE")]
+    snapshot: Option<PathBuf>,
+}
+
+/// Flies what `arguments` ask for, prints the table and writes the files.
+///
+/// # Errors
+/// An error names the file or option at fault.
+pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let path = snapshot_path(&arguments.subject)?;
+    check_distinct_files(arguments, &path)?;
+    if let Some(file) = &arguments.json {
+        check_writable(file)?;
+    }
+    if let Some(file) = &arguments.record {
+        check_folder(file)?;
+        check_recordable(file)?;
+    }
+    if let Some(file) = &arguments.plot {
+        check_plottable(file)?;
+    }
+    let (snapshot, trained) = Snapshot::load(&path)?;
+    let in_suite = arguments.suite.is_some();
+    let config = with_overrides(&trained, &path, &arguments.overrides, in_suite)?;
+    let courses = courses(arguments, &config, &path).and_then(|courses| {
+        courses.check_reach()?;
+        Ok(courses)
+    });
+    let courses = match arguments.overrides.join(" --set ") {
+        none if none.is_empty() => courses?,
+        overrides => courses.with_context(|| format!("with --set {overrides}"))?,
+    };
+    if arguments.record.is_some() {
+        let episodes = courses.evaluation().map(|entry| entry.episodes).sum();
+        check_recording(episodes, courses.most_records(), free_memory())?;
+    }
+    let courses = Arc::new(courses);
+    let threads = arguments
+        .threads
+        .map_or_else(std::thread::available_parallelism, Ok)
+        .unwrap_or(NonZeroUsize::MIN);
+    let keep = match (&arguments.record, &arguments.plot) {
+        (Some(_), _) => Keep::Records,
+        (None, Some(_)) => Keep::Positions(MOST_DRAWN as u64),
+        (None, None) => Keep::Scores,
+    };
+    let evaluation = Evaluation {
+        snapshot: &snapshot,
+        config: &config,
+        courses: Arc::clone(&courses),
+        threads,
+        keep,
+    };
+    note!(
+        "snapshot {} of {}: {}, {} threads",
+        snapshot.version,
+        path.display(),
+        describe_episodes(
+            &courses,
+            arguments.suite.as_ref().map_or("courses", |_| "entries")
+        ),
+        evaluation.threads()
+    );
+    note!(
+        "networks are computed with {}; images are drawn with {}",
+        Isa::best(),
+        InstructionSet::best()
+    );
+    if !arguments.overrides.is_empty() {
+        note!("changed settings: {}", arguments.overrides.join(", "));
+    }
+    for note in shapes_trained_on(&config, &courses) {
+        note!("{note}");
+    }
+    let evaluated = evaluation.run()?;
+
+    // Files first: the terminal may be gone. A file that cannot be written costs no other result.
+    let json = arguments.json.as_deref();
+    let written = json.map_or(Ok(()), |file| {
+        let report = WrittenReport {
+            report: &evaluated.report,
+            changed_settings: &arguments.overrides,
+        };
+        write_json(file, &report)
+    });
+    let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
+        let names: Vec<_> = courses
+            .evaluation()
+            .map(|entry| entry.name.as_str())
+            .collect();
+        write_recording(file, &names, config.vae.latent, &evaluated.episodes)
+    });
+    let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
+        plot::draw(&courses, &evaluated.episodes, file)
+    });
+    show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
+    written?;
+    recorded?;
+    Ok(drawn?)
+}
+
+fn write_json(file: &Path, report: &WrittenReport<'_>) -> anyhow::Result<()> {
+    let json = serde_json::to_string_pretty(report).context("cannot write the result as JSON")?;
+    fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))
+}
+
+/// Checks that a picture can be written to `file`. A picture replaces the file, so nothing but a
+/// regular file may be there.
+fn check_plottable(file: &Path) -> anyhow::Result<()> {
+    if fs::metadata(file).is_ok_and(|there| !there.is_file()) {
+        bail!(
+            "cannot write {}: it is not a regular file, so a picture cannot replace it; \
+             name another",
+            file.display()
+        );
+    }
+    check_writable(file)
+}
+
+/// Result as JSON, with the settings in which it differs from the training.
+#[derive(Serialize)]
+struct WrittenReport<'a> {
+    #[serde(flatten)]
+    report: &'a EvaluationReport,
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    changed_settings: &'a [String],
+}
+
+/// Refuses an output file that is also another output or an input: one would be lost.
+fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Result<()> {
+    let outputs = [
+        ("--json", arguments.json.clone()),
+        ("--record", arguments.record.clone()),
+        ("--plot", arguments.plot.clone()),
+        (
+            "the unfinished file of --record",
+            arguments.record.as_deref().map(temporary_path),
+        ),
+    ];
+    let outputs: Vec<_> = outputs
+        .into_iter()
+        .filter_map(|(option, file)| Some((option, file?)))
+        .collect();
+    let inputs = [("the snapshot", snapshot.to_owned())]
+        .into_iter()
+        .chain(
+            arguments
+                .course
+                .iter()
+                .map(|file| ("--course", file.clone())),
+        )
+        .chain(arguments.suite.iter().map(|file| ("--suite", file.clone())));
+    let all: Vec<_> = outputs.iter().cloned().chain(inputs).collect();
+    for (number, (option, file)) in outputs.iter().enumerate() {
+        let same = all[number + 1..]
+            .iter()
+            .find(|(_, other)| is_same_file(file, other));
+        if let Some((other, _)) = same {
+            bail!(
+                "{option} and {other} are the same file, {}, of which one would be lost; name \
+                another",
+                file.display()
+            );
+        }
+    }
+    Ok(())
+}
+
+/// `true` if both paths lead to one regular file, or to one that does not exist yet.
+fn is_same_file(one: &Path, other: &Path) -> bool {
+    match (fs::metadata(one), fs::metadata(other)) {
+        (Ok(one), Ok(other)) => {
+            one.is_file() && (one.dev(), one.ino()) == (other.dev(), other.ino())
+        }
+        (Err(_), Err(_)) => {
+            let place = |path: &Path| {
+                let folder = std::path::absolute(path)
+                    .ok()?
+                    .parent()?
+                    .canonicalize()
+                    .ok()?;
+                Some(folder.join(path.file_name()?))
+            };
+            place(one).is_some_and(|place_of_one| Some(place_of_one) == place(other))
+        }
+        _ => false,
+    }
+}
+
+/// Checks that `file` can be written, so that a long evaluation is not lost. Leaves no file behind
+/// and does not change an existing one.
+fn check_writable(file: &Path) -> anyhow::Result<()> {
+    check_folder(file)?;
+    let cannot_write = || format!("cannot write {}", file.display());
+    match fs::metadata(file) {
+        // Opening a pipe would wait for its reader.
+        Ok(there) if !there.is_file() && !there.is_dir() => Ok(()),
+        Ok(_) => OpenOptions::new()
+            .write(true)
+            .open(file)
+            .map(drop)
+            .with_context(cannot_write),
+        Err(_) => File::create(file)
+            .and_then(|_| fs::canonicalize(file))
+            // If a link names it, the link stays.
+            .and_then(fs::remove_file)
+            .with_context(cannot_write),
+    }
+}
+
+/// Checks that the folder of `file` exists: the system reports a missing folder like a missing
+/// file.
+fn check_folder(file: &Path) -> anyhow::Result<()> {
+    let folder = match file.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    if !folder.is_dir() {
+        bail!(
+            "cannot write {}: folder {} does not exist; create it, or name another",
+            file.display(),
+            folder.display()
+        );
+    }
+    Ok(())
+}
+
+fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
+    let Some(run) = &subject.run else {
+        return subject
+            .snapshot
+            .clone()
+            .context("neither --run nor --snapshot is given");
+    };
+    let directory = RunDirectory::new(run);
+    // For a run with an identity, this checks that its courses are those it was trained and
+    // evaluated on.
+    if directory.identity().is_file() {
+        directory.open()?;
+    }
+    let candidates = [directory.best_snapshot(), directory.latest_snapshot()];
+    let found = candidates.iter().find(|path| path.is_file()).cloned();
+    found.with_context(|| {
+        format!(
+            "{} holds neither snapshots/best.safetensors nor snapshots/latest.safetensors: is it \
+            the directory of a run whose first epoch has ended?",
+            run.display()
+        )
+    })
+}
+
+/// Loads the courses that the arguments name.
+fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::Result<Courses> {
+    let courses = match (&arguments.suite, arguments.course.as_slice()) {
+        (Some(file), _) => Courses::of_suite(config, Suite::load(file)?)
+            .with_context(|| format!("{} cannot be flown", file.display()))?,
+        (None, []) => Courses::of_files(config, &evaluation_courses(config, snapshot)?)?,
+        (None, files) => Courses::of_files(config, files)?,
+    };
+    Ok(match arguments.episodes {
+        Some(episodes) => courses.with_episodes(episodes),
+        None => courses,
+    })
+}
+
+/// Describes the episodes; `entries` is the word for what has a number of episodes.
+fn describe_episodes(courses: &Courses, entries: &str) -> String {
+    let episodes: Vec<u64> = courses.evaluation().map(|entry| entry.episodes).collect();
+    match episodes.as_slice() {
+        [first, others @ ..] if others.iter().all(|episodes| episodes == first) => {
+            format!("{first} episodes on each of {} {entries}", episodes.len())
+        }
+        _ => format!(
+            "{} episodes in {} {entries}",
+            episodes.iter().sum::<u64>(),
+            episodes.len()
+        ),
+    }
+}
+
+/// Returns a note for each entry with generated shapes that the snapshot was trained on: its result
+/// does not measure performance on new shapes.
+fn shapes_trained_on(config: &Config, courses: &Courses) -> Vec<String> {
+    let trained = &courses.settings().generator.shapes;
+    let known = |entry: &SuiteEntry| match &entry.courses {
+        EntryCourses::Generated { ranges, .. } if config.courses.generated_share > 0.0 => {
+            let shapes = ranges.shapes.iter().filter(|shape| trained.contains(shape));
+            shapes.map(|shape| shape.name()).collect::<Vec<_>>()
+        }
+        _ => Vec::new(),
+    };
+    courses
+        .evaluation()
+        .map(|entry| (entry, known(entry)))
+        .filter(|(_, known)| !known.is_empty())
+        .map(|(entry, known)| {
+            let shapes = known.join(", ");
+            format!(
+                "note: \"{}\" flies shapes that this snapshot was trained on: {shapes}",
+                entry.name
+            )
+        })
+        .collect()
+}
+
+/// Returns the evaluation courses of the run that trained the snapshot, from the run's directory,
+/// which may have moved.
+fn evaluation_courses(config: &Config, snapshot: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let snapshot =
+        std::path::absolute(snapshot).with_context(|| format!("{}", snapshot.display()))?;
+    // The snapshot is DIR/snapshots/best.safetensors; courses lie in DIR/courses/.
+    let folder = RunDirectory::new(snapshot.ancestors().nth(2).unwrap_or(Path::new("/"))).courses();
+    let find = |path: &PathBuf| {
+        let file = folder.join(path.file_name().unwrap_or_default());
+        file.is_file().then(|| file.clone()).with_context(|| {
+            format!(
+                "{}, an evaluation course of the snapshot's run, does not exist; name course \
+                files with --course",
+                file.display()
+            )
+        })
+    };
+    config.courses.evaluation.iter().map(find).collect()
+}
+
+fn threads_help() -> String {
+    format!(
+        "Most threads to fly on; at most {MAX_THREADS}, and one per episode. By default one per \
+        core"
+    )
+}
+
+/// Returns the description of a recording's arrays, for the long help.
+fn columns_help() -> String {
+    let rows = COLUMNS.iter().map(|column| {
+        let shape: Vec<_> = std::iter::once("n".to_owned())
+            .chain(column.shape.iter().map(ToString::to_string))
+            .collect();
+        let shape = format!("[{}]", shape.join(", "));
+        (column.name, column.kind, shape, column.meaning)
+    });
+    let names = NAME_LISTS.iter();
+    let lists = names.map(|&(name, shape, meaning)| (name, "<U", shape.to_owned(), meaning));
+    let lines: Vec<_> = rows
+        .chain(lists)
+        .map(|(name, kind, shape, meaning)| format!("  {name:<17} {kind:<4} {shape:<14} {meaning}"))
+        .collect();
+    format!(
+        "Arrays in the file of --record, read by numpy.load(FILE); one row per observation, \
+        episodes and courses in order:\n{}\n\n\
+        Exit status: 0 flown, 1 failed, 2 wrong arguments.",
+        lines.join("\n")
+    )
+}

@@ -1,0 +1,112 @@
+//! Directory of a new run: created, filled with copies, and removed if the run never starts.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs::{self, DirBuilder, Permissions};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+
+use skein_protocol::config::{Config, CoursesSection};
+use skein_run::RunDirectory;
+
+use super::PrepareError;
+
+/// A run's directory is accessible to its owner only.
+const OWNER_ONLY: u32 = 0o700;
+
+/// Directory of a new run, created or found empty.
+#[derive(Debug)]
+pub struct NewDirectory {
+    root: PathBuf,
+    origin: Origin,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Origin {
+    Made,
+    Found,
+}
+
+impl NewDirectory {
+    /// Creates `directory` unless it exists and is empty. Only its owner can access it afterwards.
+    ///
+    /// # Errors
+    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with the path.
+    pub(super) fn make(directory: &Path) -> Result<Self, PrepareError> {
+        let io = |source| PrepareError::Io {
+            path: directory.to_owned(),
+            source,
+        };
+        if let Some(parent) = directory.parent() {
+            fs::create_dir_all(parent).map_err(io)?;
+        }
+        let origin = match DirBuilder::new().mode(OWNER_ONLY).create(directory) {
+            Ok(()) => Origin::Made,
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Origin::Found,
+            Err(error) => return Err(io(error)),
+        };
+        if fs::read_dir(directory).map_err(io)?.next().is_some() {
+            return Err(PrepareError::NotEmpty(directory.to_owned()));
+        }
+        // Of two starts that found it empty, one makes this folder.
+        match fs::create_dir(RunDirectory::new(directory).courses()) {
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                return Err(PrepareError::NotEmpty(directory.to_owned()));
+            }
+            made => made.map_err(io)?,
+        }
+        fs::set_permissions(directory, Permissions::from_mode(OWNER_ONLY)).map_err(io)?;
+        let root = directory.canonicalize().map_err(io)?;
+        Ok(Self { root, origin })
+    }
+
+    /// Returns its absolute path.
+    pub(super) fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Restores the previous state: nothing in the directory is worth keeping.
+    ///
+    /// # Errors
+    /// Returns an error if something cannot be removed.
+    pub fn take_back(&self) -> io::Result<()> {
+        if self.origin == Origin::Made {
+            return fs::remove_dir_all(&self.root);
+        }
+        for entry in fs::read_dir(&self.root)? {
+            let entry = entry?;
+            if entry.file_type()?.is_dir() {
+                fs::remove_dir_all(entry.path())?;
+            } else {
+                fs::remove_file(entry.path())?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Copies the course files into the run's directory and makes the configuration refer to the
+/// copies, so that the run stays reproducible when the originals change.
+pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
+    let folder = RunDirectory::new(root).courses();
+    let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
+    for path in config.courses.paths_mut() {
+        let stem = CoursesSection::stem_of(path);
+        let mut name = OsString::from(format!("{stem}.toml"));
+        for number in 2.. {
+            if copies.get(&name).is_none_or(|original| original == path) {
+                break;
+            }
+            name = format!("{stem}_{number}.toml").into();
+        }
+        let copy = folder.join(&name);
+        // A copy has the original's mode, whatever the umask.
+        fs::copy(&*path, &copy)
+            .and_then(|_| fs::set_permissions(&copy, Permissions::from_mode(0o600)))
+            .map_err(|source| PrepareError::Io { path: copy, source })?;
+        let relative = Path::new("courses").join(&name);
+        copies.insert(name, std::mem::replace(path, relative));
+    }
+    Ok(())
+}
