@@ -87,7 +87,7 @@ pub(crate) struct RunArguments {
 }
 
 const RUN_NOTES: &str = "\
-Ctrl-C stops in order: episodes in the air are abandoned, the updates of the epoch are finished, \
+Ctrl-C stops in order: episodes under way are abandoned, the updates of the epoch are finished, \
 everything learned is saved. A second Ctrl-C stops at once; --resume then continues from the \
 newest checkpoint.
 

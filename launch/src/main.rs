@@ -186,7 +186,9 @@ fn draw_if_possible(run: &RunDirectory, config: &Config) {
     report_failures(&plots.failures);
     if !plots.failures.is_empty() {
         let root = quoted(run.root());
-        note!("skein: everything else is kept; to draw again: skein report --run {root}");
+        note!(
+            "skein: everything else is kept; to draw again: target/release/skein report --run {root}"
+        );
     }
 }
 

@@ -120,7 +120,7 @@ fn listen(kind: SignalKind) -> std::io::Result<Option<Signal>> {
         .transpose()
 }
 
-/// Waits for a signal, for ever if it is ignored.
+/// Waits for a signal, forever if it is ignored.
 async fn arrival(signal: &mut Option<Signal>) {
     match signal {
         Some(signal) => {

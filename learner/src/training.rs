@@ -74,8 +74,7 @@ struct Training<'a> {
     resumes: u64,
     /// Epochs or segments that are ordered but not learned from.
     in_flight: VecDeque<OrderInFlight>,
-    /// Episode of which some segments are learned from and others are not flown yet, without
-    /// images.
+    /// Open episode: its first segments are learned from, the rest is not flown. Holds no images.
     open_episode: Option<CommittedEpisode>,
     /// The newest snapshot, those of the orders in flight, and the best.
     snapshots: BTreeMap<PolicyVersion, Snapshot>,

@@ -209,7 +209,7 @@ fn an_impossible_resumption_is_refused() {
     assert!(
         with_config
             .stderr
-            .contains("the configuration stored in it"),
+            .contains("the configuration it was started with"),
         "{}",
         with_config.stderr
     );

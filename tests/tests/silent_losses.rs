@@ -253,7 +253,7 @@ fn learner_that_reads_nothing() {
     }
 }
 
-/// By default, iceoryx2 waits until there is room, for ever if its reader is dead.
+/// By default, iceoryx2 waits until there is room, forever if its reader is dead.
 #[test]
 fn an_actor_whose_learner_reads_nothing_and_is_killed_is_not_held_up() {
     let (say, heard) = mpsc::channel();

@@ -37,7 +37,7 @@ pub(super) struct LearnerConnection<'a> {
     /// Time of the last heartbeat sent; a long gap means that this process was suspended.
     last_heartbeat: Instant,
     timer: LapTimer,
-    /// `true` if the learner was informed that this actor is idle, since it last was not.
+    /// `true` once the learner was notified of the present idle time.
     reported_idle: bool,
     pub(super) episodes_flown: u64,
 }

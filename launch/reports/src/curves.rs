@@ -25,7 +25,7 @@ pub struct EpisodeRow {
 
 /// Largest possible return: an episode has at most 65536 records, with rewards up to
 /// `skein_protocol::transition::MAX_MAGNITUDE`. Dividing an axis much longer than any return would
-/// take for ever.
+/// take forever.
 const LARGEST_RETURN: f64 = 1e12;
 
 /// Reads `episodes.csv`.

@@ -17,7 +17,7 @@ use super::{SupervisionPlan, SupervisorError, SupervisorEvent};
 use skein_run::log_tail::{last_words, log_tail};
 
 /// Time to wait for the last output of a learner that ended. Another process may hold its pipe
-/// open, which must not block for ever.
+/// open, which must not block forever.
 const LAST_WORDS: Duration = Duration::from_secs(1);
 
 /// Learner of a run.

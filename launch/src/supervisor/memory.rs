@@ -1,8 +1,8 @@
 //! Memory that runs out during a run.
 //!
-//! A process that touches a page of shared memory for which no memory is left dies of SIGBUS. One
-//! whose control group, or the machine, has no memory left is killed by the kernel with SIGKILL,
-//! like by a user; only the kernel's counter of such kills tells the two apart.
+//! A process that touches a page of shared memory for which no memory is left dies of SIGBUS. When
+//! a control group or the machine runs out of memory, the kernel kills a process with SIGKILL. Only
+//! the kernel's counter of such kills distinguishes this from a user's kill.
 
 use std::fs;
 use std::path::{Path, PathBuf};

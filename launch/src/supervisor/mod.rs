@@ -6,8 +6,8 @@
 //! checkpoint, and the actors stay alive and find it again by themselves. A process that is alive
 //! but silent is killed first.
 //!
-//! The order of a stop matters. The learner is stopped first, because it abandons the episodes in
-//! the air, saves its state and notifies the actors itself; only actors that still run afterwards
+//! The order of a stop matters. The learner is stopped first, because it abandons the episodes
+//! under way, saves its state and notifies the actors itself; only actors that still run afterwards
 //! are ended from here. Every wait has a deadline, so a stop always completes. Every way out of
 //! this module leaves no process behind.
 //!

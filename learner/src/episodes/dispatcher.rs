@@ -61,8 +61,8 @@ struct AttachedActor {
     tickets: VecDeque<IssuedTicket>,
     /// Number of episodes it has spoiled since the last one committed.
     spoiled: u32,
-    /// Its time by stage when first heard. An actor taken for dead by mistake is thus not counted
-    /// twice.
+    /// Stage times in its first heartbeat, subtracted later so that an actor that joins again is
+    /// not counted twice.
     first_times: StageTimes,
     times: StageTimes,
     /// `true` if it may be waiting for a ticket: no record for a ticket issued after its last

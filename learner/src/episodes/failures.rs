@@ -1,9 +1,8 @@
 //! Failed episodes, the actors that failed them, and which episodes no actor can fly.
 //!
 //! An episode is a function of its ticket, so one that is itself at fault fails with every actor.
-//! But a single actor may be broken, or lie. So an episode is given up, and the run with it, only
-//! in two cases: two actors have failed it, or the only one that failed it has no other actor
-//! beside it that could try.
+//! But a single actor may be broken. So the run fails only if two actors failed the episode, or if
+//! one did and no other is attached.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

@@ -5,7 +5,6 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 
 /// The mean of the latest values.
-/// The mean of the latest values.
 ///
 /// The sum is computed again at every call, oldest value first. A running sum would drift, and
 /// would depend on where a run was resumed.

@@ -4,7 +4,6 @@
 //! and every forward pass receives that vector ([`Parameters`]). So the critic and its target are
 //! one network with two vectors, the optimizer steps one tensor, and publishing a network is one
 //! copy.
-//! tensor, and publishing a network is one copy.
 
 mod critic;
 mod decoder;

@@ -140,8 +140,8 @@ impl<'a> Training<'a> {
         self.publish()
     }
 
-    /// Resets the result files to the checkpoint that the progress is that of: what was written
-    /// after it will be computed again.
+    /// Cuts the result files back to the newest checkpoint. What came later will be computed
+    /// again.
     fn reset_results(&mut self) -> Result<(), TrainingError> {
         let best = self
             .progress

@@ -30,13 +30,15 @@ pub(crate) struct PanelWork<'a> {
     pub(crate) rows: usize,
     pub(crate) spans: &'a [Span],
     pub(crate) right: *const f32,
-    /// All terms of the product. Panel times terms is the distance between panels.
+    /// Number of terms of the whole product. Consecutive panels lie `terms` times the panel's width
+    /// apart.
     pub(crate) terms: usize,
     /// One panel; for a single row also [`ROW_PANELS`] full ones side by side.
     pub(crate) panel: Panel,
     pub(crate) begin: Begin,
     pub(crate) end: End,
-    /// Address of the panel's first column, from which `output_starts` count; likewise a gate's.
+    /// Address of the panel's first column in the output. `output_starts` are offsets from it, and
+    /// from the gate's address.
     pub(crate) output: *mut f32,
     pub(crate) output_starts: RowStarts<'a>,
 }

@@ -129,7 +129,7 @@ macro_rules! of_height {
 }
 pub(crate) use of_height;
 
-/// Computes a tile below `panel`, which may have fewer columns than its layout has room for.
+/// Computes a tile of a panel that may be partly filled.
 ///
 /// # Safety
 /// As for [`tile`], but output, bias and gate need only have the columns that exist.

@@ -19,12 +19,13 @@ pub(super) struct LayerRanges {
 /// A tensor of PyTorch's as four dimensions, with the permutation that leads to the native order.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct OrderedTensor {
-    /// Shape in PyTorch's order.
+    /// Tensor name, as in PyTorch.
     name: String,
-    /// Dimensions of `shape` from the outermost to the innermost in native order.
+    /// Shape in PyTorch's order.
     shape: [usize; 4],
-    /// Index of the first element in the native vector.
+    /// Dimensions of `shape` from the outermost to the innermost in native order.
     axes: [usize; 4],
+    /// Index of the first element in the native vector.
     start: usize,
 }
 
