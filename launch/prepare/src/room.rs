@@ -148,7 +148,7 @@ pub fn raise_file_limit(actors: usize) -> Result<(), TooFewFiles> {
         current: Some(limit.maximum.map_or(needed, |maximum| maximum.min(needed))),
         ..limit
     };
-    let reached = match setrlimit(Resource::Nofile, raised.clone()) {
+    let reached = match setrlimit(Resource::Nofile, raised) {
         Ok(()) => raised.current,
         Err(_) => limit.current,
     };
