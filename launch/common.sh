@@ -44,14 +44,14 @@ build_evaluation() {
 # Builds what training needs.
 build_training() {
     "$repository/launch/setup.sh"
-    cargo_build "building learner, actor and supervisor (about 7 minutes on two cores the first time)" \
+    cargo_build "building learner, actor and supervisor, with libtorch (about 4 to 6 minutes on two cores the first time)" \
         --bin skein --bin skein-learner --bin skein-actor
 }
 
 # Builds every program.
 build() {
     "$repository/launch/setup.sh"
-    cargo_build "building all programs (about 8 minutes on two cores the first time)" --bins
+    cargo_build "building all programs (about 6 minutes on two cores the first time)" --bins
 }
 
 # Builds of the workspace what the arguments name; says what and how long only if something is to be done. Always --workspace: a

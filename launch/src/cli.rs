@@ -163,10 +163,10 @@ pub(crate) struct ExperimentArguments {
     ///
     /// The pictures go to docs/results/pictures/, the figures of each run to
     /// docs/results/runs/NAME.csv. What stands around the two lines is kept.
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     pub(crate) publish: bool,
     /// Repository that holds the experiments and the documents; launch/experiment.sh sets it.
-    #[arg(long, value_name = "DIR", default_value = ".")]
+    #[arg(long, value_name = "DIR", default_value = ".", hide_short_help = true)]
     pub(crate) repository: PathBuf,
 }
 

@@ -26,11 +26,11 @@ const PACE_SECS: f64 = 60.0;
 
 /// Display of a run's progress.
 pub struct ProgressDisplay {
-    surface: Surface,
+    surface: DisplayOutput,
     pace: Pace,
 }
 
-enum Surface {
+enum DisplayOutput {
     Terminal(ProgressBar),
     Plain {
         last: Option<(Instant, LearnerPhase)>,
@@ -51,7 +51,8 @@ pub fn bar_on_terminal() -> Option<ProgressBar> {
 impl ProgressDisplay {
     /// Returns a display for this process's standard error.
     pub fn new() -> Self {
-        let surface = bar_on_terminal().map_or(Surface::Plain { last: None }, Surface::Terminal);
+        let surface =
+            bar_on_terminal().map_or(DisplayOutput::Plain { last: None }, DisplayOutput::Terminal);
         Self {
             surface,
             pace: Pace::default(),
@@ -75,7 +76,7 @@ impl ProgressDisplay {
 
     /// Removes the bar, so that other text can be printed.
     pub fn finish(&self) {
-        if let Surface::Terminal(bar) = &self.surface {
+        if let DisplayOutput::Terminal(bar) = &self.surface {
             bar.finish_and_clear();
         }
     }
@@ -91,7 +92,7 @@ impl Watcher for ProgressDisplay {
     fn progress(&mut self, progress: &ProgressReport, restarts: Restarts) {
         let (head, figures) = self.text(progress, restarts);
         match &mut self.surface {
-            Surface::Terminal(bar) => {
+            DisplayOutput::Terminal(bar) => {
                 let (position, length) = match progress.phase {
                     LearnerPhase::Evaluating => progress.evaluation_episodes,
                     LearnerPhase::Flying | LearnerPhase::Learning | LearnerPhase::Finishing => {
@@ -104,7 +105,7 @@ impl Watcher for ProgressDisplay {
                 let head = wrapped(&head, columns.saturating_sub(LEAST_BAR));
                 bar.set_message(format!("{head}\n{}", wrapped(&figures, columns)));
             }
-            Surface::Plain { last } => {
+            DisplayOutput::Plain { last } => {
                 let due = last.is_none_or(|(when, phase)| {
                     when.elapsed() >= LINE_INTERVAL
                         || (phase == LearnerPhase::Evaluating)
@@ -123,8 +124,8 @@ impl Watcher for ProgressDisplay {
 
     fn warn(&mut self, text: &str) {
         match &self.surface {
-            Surface::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
-            Surface::Plain { .. } => note!("skein: {text}"),
+            DisplayOutput::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
+            DisplayOutput::Plain { .. } => note!("skein: {text}"),
         }
     }
 }

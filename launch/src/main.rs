@@ -187,7 +187,8 @@ fn draw_if_possible(run: &RunDirectory, config: &Config) {
     if !plots.failures.is_empty() {
         let root = quoted(run.root());
         note!(
-            "skein: everything else is kept; to draw again: target/release/skein report --run {root}"
+            "skein: everything else is kept; to draw again: \
+             target/release/skein report --run {root}"
         );
     }
 }

@@ -9,7 +9,7 @@ use std::fmt;
 
 use skein_kernels::Team;
 use skein_protocol::config::{Config, CriticInput};
-use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
+use skein_protocol::{ACTION, CRITIC_STATE, IMAGE_PIXELS};
 
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
@@ -80,7 +80,7 @@ impl Inputs {
         match config.learning.critic_input {
             CriticInput::Observation => same,
             CriticInput::GroundTruth => Self {
-                critic: PRIVILEGED_STATE,
+                critic: CRITIC_STATE,
                 ..same
             },
         }

@@ -160,12 +160,12 @@ impl CommittedEpisode {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes the critic's input at the beginning of `step`, `[PRIVILEGED_STATE]`, where the critic
+    /// Writes the critic's input at the beginning of `step`, `[CRITIC_STATE]`, where the critic
     /// sees the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
     ///
     /// It holds the ground truth, the velocity, the tilt, and the action before, which under
     /// latency has yet to take effect. Each number is roughly within [-2, 2].
-    pub fn write_true_state(&self, step: usize, into: &mut [f32]) {
+    pub fn write_critic_state(&self, step: usize, into: &mut [f32]) {
         let seen = &self.observations[step];
         let [roll, pitch, ..] = seen.orientation;
         let truth = seen
@@ -292,7 +292,7 @@ pub(crate) mod samples {
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::PRIVILEGED_STATE;
+    use skein_protocol::CRITIC_STATE;
     use skein_protocol::config::Observation;
 
     use super::*;
@@ -354,14 +354,14 @@ mod tests {
     #[test]
     fn the_true_state_is_the_ground_truth_the_motion_and_the_action_before() {
         let episode = samples::episode(3, 5, Outcome::Collided);
-        let mut state = [f32::NAN; PRIVILEGED_STATE];
-        episode.write_true_state(4, &mut state);
+        let mut state = [f32::NAN; CRITIC_STATE];
+        episode.write_critic_state(4, &mut state);
         let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
         assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
         assert_eq!(state[16..19], seen.velocity_mps);
         assert_eq!(state[21..], episode.actions[3]);
-        episode.write_true_state(0, &mut state);
+        episode.write_critic_state(0, &mut state);
         assert_eq!(state[21..], [0.0, 0.0]);
     }
 

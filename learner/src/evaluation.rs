@@ -49,7 +49,7 @@ where
 
 /// A row of `evaluation_trajectories.csv`.
 #[derive(Debug, Serialize)]
-struct TrajectoryRow<'a> {
+struct TrajectoryPoint<'a> {
     course: &'a str,
     episode: usize,
     step: usize,
@@ -122,7 +122,7 @@ fn write_trajectory(
 ) -> Result<(), csv::Error> {
     for (step, observation) in episode.observations.iter().enumerate() {
         let [x_m, y_m, z_m] = observation.position_m;
-        trajectories.serialize(TrajectoryRow {
+        trajectories.serialize(TrajectoryPoint {
             course,
             episode: number,
             step,

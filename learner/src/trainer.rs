@@ -433,9 +433,9 @@ fn draws(
 }
 
 fn columns(minibatch: &Minibatch) -> Columns<'_> {
-    let (states, next_states) = match minibatch.true_states.is_empty() {
+    let (states, next_states) = match minibatch.critic_states.is_empty() {
         true => (&minibatch.observations, &minibatch.next_observations),
-        false => (&minibatch.true_states, &minibatch.next_true_states),
+        false => (&minibatch.critic_states, &minibatch.next_critic_states),
     };
     Columns {
         states,

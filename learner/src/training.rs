@@ -159,13 +159,13 @@ impl Training<'_> {
         let before = self.trainer.all_updates();
         self.train_vae()?;
         self.train_policy()?;
-        self.publish_if_due(self.trainer.all_updates() > before)
+        self.publish_if_due(self.trainer.all_updates() - before)
     }
 
-    /// Publishes the next version. After a segment without updates, the present snapshot stays in
-    /// use.
-    fn publish_if_due(&mut self, is_updated: bool) -> Result<(), TrainingError> {
-        if self.open_episode.is_some() && !is_updated {
+    /// Publishes the next version, after so many `updates`. After a segment without any, the present
+    /// snapshot stays in use.
+    fn publish_if_due(&mut self, updates: u64) -> Result<(), TrainingError> {
+        if self.open_episode.is_some() && updates == 0 {
             return Ok(());
         }
         self.progress.version += 1;

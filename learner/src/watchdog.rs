@@ -16,7 +16,7 @@ const RECEIVER_PATIENCE: Duration = Duration::from_secs(20);
 /// Examines every progress report.
 #[derive(Debug)]
 pub(crate) struct Watchdog {
-    done: Option<WorkDone>,
+    done: Option<HealthCounters>,
     /// Time at which this state was first seen.
     since: Instant,
     /// Time of the last warning about the present stall.
@@ -25,7 +25,7 @@ pub(crate) struct Watchdog {
 
 /// All counters that a healthy run advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct WorkDone {
+struct HealthCounters {
     phase: LearnerPhase,
     episodes: u64,
     steps: u64,
@@ -54,7 +54,7 @@ impl Watchdog {
         obstacle: Option<String>,
         receiver: Option<(Duration, Situation)>,
     ) -> Option<String> {
-        let done = WorkDone {
+        let done = HealthCounters {
             phase: progress.phase,
             episodes: progress.episodes,
             steps: progress.steps,

@@ -45,7 +45,7 @@ pub const ACTION: usize = 2;
 pub const GROUND_TRUTH: usize = 16;
 /// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
 /// `[2]` and previous action.
-pub const PRIVILEGED_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
+pub const CRITIC_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
 /// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike. Beyond
 /// them tanh saturates or the noise vanishes (as in the authors' implementation of
 /// arXiv:1812.05905).

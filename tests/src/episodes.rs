@@ -10,7 +10,7 @@ use skein_run::RunDirectory;
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 #[allow(missing_docs)] // the columns, by their names
-pub struct EpisodeRow {
+pub struct RecordedEpisode {
     pub episode: u64,
     pub epoch: u64,
     pub policy_version: u64,
@@ -27,7 +27,7 @@ pub struct EpisodeRow {
 ///
 /// # Panics
 /// Panics if a row is malformed.
-pub fn episodes(run: &RunDirectory) -> Vec<EpisodeRow> {
+pub fn episodes(run: &RunDirectory) -> Vec<RecordedEpisode> {
     let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
     csv::Reader::from_reader(whole.as_bytes())
@@ -41,12 +41,12 @@ pub fn episodes(run: &RunDirectory) -> Vec<EpisodeRow> {
 #[derive(Debug, Clone)]
 pub struct LearnedResults {
     policy_sha256: String,
-    episodes: Vec<EpisodeRow>,
+    episodes: Vec<RecordedEpisode>,
 }
 
 impl LearnedResults {
     pub(crate) fn of(run: &RunDirectory, summary: &Summary) -> Self {
-        let nobody = |episode| EpisodeRow {
+        let nobody = |episode| RecordedEpisode {
             actor: 0,
             ..episode
         };

@@ -13,7 +13,7 @@ mod episodes;
 mod programs;
 mod run;
 
-pub use episodes::{EpisodeRow, LearnedResults, episodes};
+pub use episodes::{LearnedResults, RecordedEpisode, episodes};
 pub use programs::{ProgramOutput, program, repository, run_program};
 pub use run::{EndedRun, RunRecipe, RunningRun};
 pub use skein_chaos::{ListedProcess, Role, leftovers, processes_of};

@@ -16,7 +16,7 @@ use skein_run::signals::heed;
 use skein_run::{RunDirectory, sweep_leftovers};
 use tempfile::TempDir;
 
-use crate::episodes::{EpisodeRow, LearnedResults, episodes};
+use crate::episodes::{LearnedResults, RecordedEpisode, episodes};
 use crate::programs::{ProgramOutput, program, repository};
 
 /// Time limit of a run. On an idle machine, none takes a fifth of it.
@@ -442,7 +442,7 @@ impl EndedRun {
     ///
     /// # Panics
     /// Panics if it is malformed.
-    pub fn episodes(&self) -> Vec<EpisodeRow> {
+    pub fn episodes(&self) -> Vec<RecordedEpisode> {
         episodes(&self.directory)
     }
 

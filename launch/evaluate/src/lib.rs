@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::memory::{check_recording, free_memory};
-use crate::settings::with_overrides;
+use crate::settings::{Flown, with_overrides};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use serde::Serialize;
@@ -114,8 +114,11 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_plottable(file)?;
     }
     let (snapshot, trained) = Snapshot::load(&path)?;
-    let in_suite = arguments.suite.is_some();
-    let config = with_overrides(&trained, &path, &arguments.overrides, in_suite)?;
+    let flown = match arguments.suite {
+        Some(_) => Flown::Suite,
+        None => Flown::Courses,
+    };
+    let config = with_overrides(&trained, &path, &arguments.overrides, flown)?;
     let courses = courses(arguments, &config, &path).and_then(|courses| {
         courses.check_reach()?;
         Ok(courses)

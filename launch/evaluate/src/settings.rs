@@ -20,9 +20,17 @@ const UNUSED: [(&str, &str); 4] = [
     ),
 ];
 
+/// What an evaluation flies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Flown {
+    /// Courses, with the disturbances of the configuration.
+    Courses,
+    /// A suite, whose entries have disturbances of their own.
+    Suite,
+}
+
 /// Returns the configuration of the snapshot at `snapshot` with `overrides`, `section.key=value`:
-/// keys in `[simulator]`, and `run.seed`, from which the episodes' seeds derive. In a suite
-/// (`in_suite`), each entry has its own disturbances.
+/// keys in `[simulator]`, and `run.seed`, from which the episodes' seeds derive.
 ///
 /// # Errors
 /// Names the key, the value and the remedy: the value is invalid, or the key belongs to the
@@ -31,7 +39,7 @@ pub(crate) fn with_overrides(
     config: &Config,
     snapshot: &Path,
     overrides: &[String],
-    in_suite: bool,
+    flown: Flown,
 ) -> anyhow::Result<Config> {
     let message = |overrides: &[String]| {
         let changed = config.overridden(snapshot, overrides);
@@ -58,7 +66,7 @@ pub(crate) fn with_overrides(
         if let Some((_, remedy)) = UNUSED.iter().find(|(unused, _)| is_in(unused)) {
             bail!("--set {text}: {key} has no effect on an evaluation; {remedy}");
         }
-        if in_suite && is_in("simulator.disturbances") {
+        if flown == Flown::Suite && is_in("simulator.disturbances") {
             bail!(
                 "--set {text}: {key} has no effect on a suite, whose entries have disturbances of \
                 their own; change the suite, or name courses with --course"
@@ -92,10 +100,10 @@ fn has_other_networks(here: &Config, there: &Config) -> bool {
 mod tests {
     use super::*;
 
-    fn set(overrides: &[&str], in_suite: bool) -> Result<Config, String> {
+    fn set(overrides: &[&str], flown: Flown) -> Result<Config, String> {
         let overrides: Vec<_> = overrides.iter().map(ToString::to_string).collect();
         let snapshot = Path::new("best.safetensors");
-        with_overrides(&Config::default(), snapshot, &overrides, in_suite)
+        with_overrides(&Config::default(), snapshot, &overrides, flown)
             .map_err(|error| error.to_string())
     }
 
@@ -108,7 +116,7 @@ mod tests {
                 "simulator.disturbances.mass_spread=0.1",
                 "run.seed=7",
             ],
-            false,
+            Flown::Courses,
         )
         .unwrap();
         assert_eq!(config.run.seed, 7);
@@ -134,15 +142,15 @@ mod tests {
             ("vae.latent=17", "set it to one of them"),
             ("simulator.max_steps", "has no `=`"),
         ] {
-            let error = set(&["simulator.max_steps=200", key], false).unwrap_err();
+            let error = set(&["simulator.max_steps=200", key], Flown::Courses).unwrap_err();
             assert!(
                 error.contains(&format!("--set {key}")) && error.contains(part),
                 "{key}: {error}"
             );
         }
         let gusts = "simulator.disturbances.gust.force_rms_n=0.1";
-        assert!(set(&[gusts], false).is_ok());
-        let error = set(&[gusts], true).unwrap_err();
+        assert!(set(&[gusts], Flown::Courses).is_ok());
+        let error = set(&[gusts], Flown::Suite).unwrap_err();
         assert!(error.contains("disturbances of their own"), "{error}");
     }
 }

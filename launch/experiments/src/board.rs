@@ -59,13 +59,13 @@ pub struct ExperimentProgress {
 
 /// Display of an experiment's progress.
 pub struct ExperimentDisplay {
-    surface: Surface,
+    surface: BoardOutput,
     started: Instant,
     /// Number of episodes when this session started.
     first_episodes: Option<u64>,
 }
 
-enum Surface {
+enum BoardOutput {
     Terminal(ProgressBar),
     Plain { last: Option<Instant> },
 }
@@ -74,7 +74,7 @@ impl ExperimentDisplay {
     /// Returns a display on `bar`, or on this process's standard error if there is none.
     pub fn new(bar: Option<ProgressBar>) -> Self {
         Self {
-            surface: bar.map_or(Surface::Plain { last: None }, Surface::Terminal),
+            surface: bar.map_or(BoardOutput::Plain { last: None }, BoardOutput::Terminal),
             started: Instant::now(),
             first_episodes: None,
         }
@@ -85,14 +85,14 @@ impl ExperimentDisplay {
         let first = *self.first_episodes.get_or_insert(progress.episodes);
         let head = head(progress, self.started.elapsed().as_secs_f64(), first);
         match &mut self.surface {
-            Surface::Terminal(bar) => {
+            BoardOutput::Terminal(bar) => {
                 bar.set_length(progress.total_episodes);
                 bar.set_position(progress.episodes);
                 let columns = stderr_columns();
                 let head = wrapped(&head, columns.saturating_sub(LEAST_BAR));
                 bar.set_message(format!("{head}{}", lines(&progress.under_way, columns)));
             }
-            Surface::Plain { last } => {
+            BoardOutput::Plain { last } => {
                 if last.is_none_or(|when| when.elapsed() >= LINE_INTERVAL) {
                     *last = Some(Instant::now());
                     let runs: Vec<_> = progress.under_way.iter().map(RunProgress::brief).collect();
@@ -106,14 +106,14 @@ impl ExperimentDisplay {
     /// Prints a line that stays visible.
     pub fn say(&self, text: &str) {
         match &self.surface {
-            Surface::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
-            Surface::Plain { .. } => note!("skein: {text}"),
+            BoardOutput::Terminal(bar) => bar.suspend(|| note!("skein: {text}")),
+            BoardOutput::Plain { .. } => note!("skein: {text}"),
         }
     }
 
     /// Removes the bar, so that other text can be printed.
     pub fn finish(&self) {
-        if let Surface::Terminal(bar) = &self.surface {
+        if let BoardOutput::Terminal(bar) = &self.surface {
             bar.finish_and_clear();
         }
     }

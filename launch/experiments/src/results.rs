@@ -12,7 +12,7 @@ use super::definition::{Axis, Measure};
 use super::plan::{ExperimentPlan, PlannedRun, RunState};
 use super::statistics::{dispersion_across_time, drawdowns, level, volatility};
 use skein_reports::ReportError;
-use skein_reports::curves::{EpisodeRow, read_episodes, trailing_mean};
+use skein_reports::curves::{PlottedEpisode, read_episodes, trailing_mean};
 
 /// A complete run.
 #[derive(Debug)]
@@ -28,7 +28,7 @@ pub struct RunResult {
     /// Evaluation of its best snapshot in the experiment's suite, if there is one and it was flown.
     pub suite: Option<EvaluationReport>,
     /// Its training episodes, in order.
-    pub(super) episodes: Vec<EpisodeRow>,
+    pub(super) episodes: Vec<PlottedEpisode>,
     window: usize,
     warmup_steps: u64,
 }

@@ -26,7 +26,7 @@ use super::definition::{Experiment, FlownSuite};
 use super::plan::{ACTORS, ExperimentPlan, PlannedRun, RunState};
 use crate::results::{RunResult, of_suite};
 use skein_reports::Clock;
-use skein_reports::curves::{EpisodeRow, trailing_mean};
+use skein_reports::curves::{PlottedEpisode, trailing_mean};
 use skein_run::log_tail::log_tail;
 use skein_run::orphans::signal_when_orphaned;
 use skein_run::signals::heed;
@@ -401,7 +401,7 @@ fn flown(run: &RunDirectory) -> Vec<f64> {
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
     csv::Reader::from_reader(whole.as_bytes())
         .deserialize()
-        .map_while(|row: Result<EpisodeRow, _>| row.ok())
+        .map_while(|row: Result<PlottedEpisode, _>| row.ok())
         .map(|episode| f64::from(episode.walls_passed))
         .collect()
 }

@@ -8,7 +8,7 @@ use rustix::fs::statvfs;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use skein_protocol::config::{Config, CriticInput, EncoderTraining};
 use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::{ACTION, IMAGE_PIXELS, PRIVILEGED_STATE};
+use skein_protocol::{ACTION, CRITIC_STATE, IMAGE_PIXELS};
 use skein_transport::shared_memory_needed;
 
 /// Folder of iceoryx2's segments.
@@ -148,7 +148,7 @@ pub fn raise_file_limit(actors: usize) -> Result<(), TooFewFiles> {
         current: Some(limit.maximum.map_or(needed, |maximum| maximum.min(needed))),
         ..limit
     };
-    let reached = match setrlimit(Resource::Nofile, raised.clone()) {
+    let reached = match setrlimit(Resource::Nofile, raised) {
         Ok(()) => raised.current,
         Err(_) => limit.current,
     };
@@ -193,7 +193,7 @@ fn checkpoint_bytes(config: &Config) -> u64 {
     let rows = (config.replay.capacity as u64).min(config.run.episodes.saturating_mul(records));
     let message = match learning.critic_input {
         CriticInput::Observation => 0,
-        CriticInput::GroundTruth => PRIVILEGED_STATE,
+        CriticInput::GroundTruth => CRITIC_STATE,
     };
     let row = 4 * (2 * (config.observation_layout().len() + message) + ACTION + 2) as u64;
     let steps = match learning.encoder {

@@ -13,7 +13,7 @@ const HEIGHT: u32 = 640;
 
 /// Row of `episodes.csv`, with the columns that are plotted.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
-pub struct EpisodeRow {
+pub struct PlottedEpisode {
     /// Environment steps of the episode.
     pub steps: u32,
     /// Walls passed in the episode.
@@ -32,7 +32,7 @@ const LARGEST_RETURN: f64 = 1e12;
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
+pub fn read_episodes(path: &Path) -> Result<Vec<PlottedEpisode>, ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
@@ -45,7 +45,7 @@ pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
     let mut rows = reader.into_deserialize();
     let mut episodes = Vec::new();
     while let Some(row) = rows.next() {
-        let row: EpisodeRow = row.map_err(|error| malformed(error.to_string()))?;
+        let row: PlottedEpisode = row.map_err(|error| malformed(error.to_string()))?;
         if !(-LARGEST_RETURN..=LARGEST_RETURN).contains(&row.episode_return) {
             let (line, value) = (rows.reader().position().line() - 1, row.episode_return);
             return Err(malformed(format!(
@@ -63,7 +63,7 @@ pub fn read_episodes(path: &Path) -> Result<Vec<EpisodeRow>, ReportError> {
 /// # Errors
 /// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_return(
-    episodes: &[EpisodeRow],
+    episodes: &[PlottedEpisode],
     window: usize,
     path: &Path,
 ) -> Result<(), ReportError> {
@@ -90,7 +90,7 @@ pub(super) fn draw_return(
 /// # Errors
 /// Returns [`ReportError`] if the picture cannot be drawn or written.
 pub(super) fn draw_walls_passed(
-    episodes: &[EpisodeRow],
+    episodes: &[PlottedEpisode],
     window: usize,
     ideal: Option<f64>,
     path: &Path,

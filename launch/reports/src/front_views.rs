@@ -203,8 +203,8 @@ impl FrontView<'_> {
     }
 }
 
-/// Returns where an episode first crossed the wall's front face, `[y, z]` in metres, on the straight
-/// line between two steps.
+/// Returns where an episode first crossed the wall's front face, `[y, z]` in metres, on the
+/// straight line between two steps.
 fn crossing(episode: &Trajectory, wall: &Wall) -> Option<[f32; 2]> {
     let pair = episode
         .points_m

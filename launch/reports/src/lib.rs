@@ -58,7 +58,7 @@ pub enum ReportError {
 /// Contents of the files to be drawn. A run that ended early has fewer.
 #[derive(Debug, Default)]
 pub struct RunMaterial {
-    episodes: Option<Vec<curves::EpisodeRow>>,
+    episodes: Option<Vec<curves::PlottedEpisode>>,
     reconstructions: Option<reconstructions::Pairs>,
     trajectories: Option<trajectories::TrajectoriesByCourse>,
 }

@@ -41,14 +41,14 @@ pub(super) struct Crew<'a> {
 /// One actor, across all its incarnations.
 struct Member {
     id: ActorId,
-    state: ActorState,
+    state: MemberState,
     deaths: ActorDeaths,
     standing: ActorStanding,
     /// Work done by the run when the present incarnation began.
     work_before: Option<WorkDone>,
 }
 
-enum ActorState {
+enum MemberState {
     /// A process is alive.
     Flying(ActorProcess),
     /// Died; restarts after a pause.
@@ -115,7 +115,7 @@ impl<'a> Crew<'a> {
     ) -> Self {
         let member = |&id| Member {
             id,
-            state: ActorState::Stranded,
+            state: MemberState::Stranded,
             deaths: ActorDeaths::default(),
             standing: ActorStanding::Unknown,
             work_before: None,
@@ -144,7 +144,7 @@ impl<'a> Crew<'a> {
             return Ok(());
         }
         for number in 0..self.members.len() {
-            if !matches!(self.members[number].state, ActorState::Stranded) {
+            if !matches!(self.members[number].state, MemberState::Stranded) {
                 continue;
             }
             self.members[number].deaths = ActorDeaths::default();
@@ -177,7 +177,7 @@ impl<'a> Crew<'a> {
         let child = launch.start()?;
         let (orders, receiver) = watch::channel(ProcessOrder::Run);
         let now = Instant::now();
-        member.state = ActorState::Flying(ActorProcess {
+        member.state = MemberState::Flying(ActorProcess {
             orders,
             started: now,
             heard_of: now,
@@ -201,7 +201,7 @@ impl<'a> Crew<'a> {
         let now = Instant::now();
         let is_first = self.work.replace(work).is_none();
         for member in &mut self.members {
-            let ActorState::Flying(process) = &mut member.state else {
+            let MemberState::Flying(process) = &mut member.state else {
                 continue;
             };
             // A learner that has just started has had no time to hear of any actor.
@@ -235,9 +235,9 @@ impl<'a> Crew<'a> {
     pub(super) fn exited(&mut self, number: usize, exit: &Exit) {
         let (work, learner_reports) = (self.work, self.work.is_some());
         let member = &mut self.members[number];
-        let (age, last_order) = match std::mem::replace(&mut member.state, ActorState::Gone) {
-            ActorState::Flying(process) => (process.started.elapsed(), *process.orders.borrow()),
-            ActorState::Resting | ActorState::Stranded | ActorState::Gone => {
+        let (age, last_order) = match std::mem::replace(&mut member.state, MemberState::Gone) {
+            MemberState::Flying(process) => (process.started.elapsed(), *process.orders.borrow()),
+            MemberState::Resting | MemberState::Stranded | MemberState::Gone => {
                 (Duration::ZERO, ProcessOrder::Run)
             }
         };
@@ -247,11 +247,11 @@ impl<'a> Crew<'a> {
         if *exit == Exit::SUCCESS {
             // The learner announced the end of the run. If it dies before that end, its next
             // incarnation needs actors again.
-            member.state = ActorState::Stranded;
+            member.state = MemberState::Stranded;
             return;
         }
         if exit.found_no_learner() && !learner_reports {
-            member.state = ActorState::Stranded;
+            member.state = MemberState::Stranded;
             self.last_failure = Some(GivenUp::LearnerGone);
             self.warnings
                 .push_back(format!("actor {} found no learner and left", member.id));
@@ -286,7 +286,7 @@ impl<'a> Crew<'a> {
     /// Schedules the restart of a member after `pause`.
     fn rest(&mut self, number: usize, how: &str, pause: Duration) {
         let member = &mut self.members[number];
-        member.state = ActorState::Resting;
+        member.state = MemberState::Resting;
         self.warnings.push_back(format!(
             "actor {} {how}; restarting it in {} s (log: {})",
             member.id,
@@ -302,7 +302,7 @@ impl<'a> Crew<'a> {
 
     fn give_up(&mut self, number: usize, how: &str) {
         let member = &mut self.members[number];
-        member.state = ActorState::Stranded;
+        member.state = MemberState::Stranded;
         let log = self.run.actor_log(member.id);
         let failure = format!(
             "gave up on actor {}: it died {} times without doing useful work, the last time it \
@@ -318,7 +318,7 @@ impl<'a> Crew<'a> {
 
     /// Restarts an actor whose pause is over.
     pub(super) fn restart(&mut self, number: usize) {
-        if !matches!(self.members[number].state, ActorState::Resting) {
+        if !matches!(self.members[number].state, MemberState::Resting) {
             return;
         }
         self.restarts += 1;
@@ -334,7 +334,7 @@ impl<'a> Crew<'a> {
     pub(super) fn order(&mut self, order: ProcessOrder) {
         self.let_go();
         for member in &self.members {
-            if let ActorState::Flying(process) = &member.state {
+            if let MemberState::Flying(process) = &member.state {
                 process.orders.send_replace(order);
             }
         }
@@ -344,8 +344,8 @@ impl<'a> Crew<'a> {
     pub(super) fn let_go(&mut self) {
         self.after_death = AfterDeath::LetGo;
         for member in &mut self.members {
-            if !matches!(member.state, ActorState::Flying(_)) {
-                member.state = ActorState::Gone;
+            if !matches!(member.state, MemberState::Flying(_)) {
+                member.state = MemberState::Gone;
             }
         }
     }
@@ -354,7 +354,7 @@ impl<'a> Crew<'a> {
     pub(super) fn is_alive(&self) -> bool {
         self.members
             .iter()
-            .any(|member| matches!(member.state, ActorState::Flying(_) | ActorState::Resting))
+            .any(|member| matches!(member.state, MemberState::Flying(_) | MemberState::Resting))
     }
 
     /// Returns the reason of the last actor that was given up; `None` if none was.

@@ -67,11 +67,11 @@ pub struct Minibatch {
     pub rewards: Vec<f32>,
     /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// Critic inputs before the action, `[batch, PRIVILEGED_STATE]`; empty if the critic sees the
+    /// Critic inputs before the action, `[batch, CRITIC_STATE]`; empty if the critic sees the
     /// observation.
-    pub true_states: Vec<f32>,
+    pub critic_states: Vec<f32>,
     /// Critic inputs after the action, likewise.
-    pub next_true_states: Vec<f32>,
+    pub next_critic_states: Vec<f32>,
     /// 1 where the episode ended in a state without a future, else 0; `[batch]`. The last step of a
     /// truncated episode has 0: it bootstraps.
     pub terminated: Vec<f32>,
@@ -183,8 +183,8 @@ impl Replay {
             let row = ring.claim(first_image.map(|first| first + step as u32));
             episode.write_observation(step, &self.view, row.observation);
             episode.write_observation(step + 1, &self.view, row.next_observation);
-            episode.write_true_state(step, row.true_state);
-            episode.write_true_state(step + 1, row.next_true_state);
+            episode.write_critic_state(step, row.critic_state);
+            episode.write_critic_state(step + 1, row.next_true_state);
             row.action.copy_from_slice(&episode.actions[step]);
             *row.reward = episode.rewards[step];
             *row.terminated = f32::from(step == last && episode.terminated());
@@ -329,8 +329,8 @@ impl Minibatch {
         self.actions.clear();
         self.rewards.clear();
         self.next_observations.clear();
-        self.true_states.clear();
-        self.next_true_states.clear();
+        self.critic_states.clear();
+        self.next_critic_states.clear();
         self.terminated.clear();
         self.images.clear();
         self.next_images.clear();
@@ -353,8 +353,9 @@ impl Minibatch {
             self.observations.extend_from_slice(row.observation);
             self.next_observations
                 .extend_from_slice(row.next_observation);
-            self.true_states.extend_from_slice(row.true_state);
-            self.next_true_states.extend_from_slice(row.next_true_state);
+            self.critic_states.extend_from_slice(row.critic_state);
+            self.next_critic_states
+                .extend_from_slice(row.next_true_state);
             self.actions.extend_from_slice(row.action);
             self.rewards.push(row.reward);
             self.terminated.push(row.terminated);

@@ -5,7 +5,7 @@
 //! cache lines, where one table per quantity would cost one miss each.
 
 use skein_protocol::config::{Config, CriticInput, ObservationLayout};
-use skein_protocol::{ACTION, LatentCode, PRIVILEGED_STATE};
+use skein_protocol::{ACTION, CRITIC_STATE, LatentCode};
 
 /// Layout of a row: observation, next observation, true state, next true state, action, reward,
 /// terminated, all `f32`.
@@ -14,14 +14,14 @@ pub(super) struct RowLayout {
     /// Length of an observation vector.
     pub(super) observation: usize,
     /// Length of the critic's own input; 0 if the critic sees the observation.
-    pub(super) true_state: usize,
+    pub(super) critic_state: usize,
 }
 
 /// Mutable view of one row.
 pub(super) struct TransitionRowMut<'a> {
     pub(super) observation: &'a mut [f32],
     pub(super) next_observation: &'a mut [f32],
-    pub(super) true_state: &'a mut [f32],
+    pub(super) critic_state: &'a mut [f32],
     pub(super) next_true_state: &'a mut [f32],
     pub(super) action: &'a mut [f32],
     pub(super) reward: &'a mut f32,
@@ -33,7 +33,7 @@ pub(super) struct TransitionRowMut<'a> {
 pub(super) struct TransitionRow<'a> {
     pub(super) observation: &'a [f32],
     pub(super) next_observation: &'a [f32],
-    pub(super) true_state: &'a [f32],
+    pub(super) critic_state: &'a [f32],
     pub(super) next_true_state: &'a [f32],
     pub(super) action: &'a [f32],
     pub(super) reward: f32,
@@ -45,28 +45,28 @@ impl RowLayout {
     pub(super) fn of(config: &Config) -> Self {
         Self {
             observation: config.observation_layout().len(),
-            true_state: match config.learning.critic_input {
+            critic_state: match config.learning.critic_input {
                 CriticInput::Observation => 0,
-                CriticInput::GroundTruth => PRIVILEGED_STATE,
+                CriticInput::GroundTruth => CRITIC_STATE,
             },
         }
     }
 
     /// Number of values in a row.
     pub(super) fn width(self) -> usize {
-        2 * (self.observation + self.true_state) + ACTION + 2
+        2 * (self.observation + self.critic_state) + ACTION + 2
     }
 
     fn row(self, values: &[f32]) -> TransitionRow<'_> {
         let (observation, rest) = values.split_at(self.observation);
         let (next_observation, rest) = rest.split_at(self.observation);
-        let (true_state, rest) = rest.split_at(self.true_state);
-        let (next_true_state, rest) = rest.split_at(self.true_state);
+        let (critic_state, rest) = rest.split_at(self.critic_state);
+        let (next_true_state, rest) = rest.split_at(self.critic_state);
         let (action, rest) = rest.split_at(ACTION);
         TransitionRow {
             observation,
             next_observation,
-            true_state,
+            critic_state,
             next_true_state,
             action,
             reward: rest[0],
@@ -77,14 +77,14 @@ impl RowLayout {
     fn row_mut(self, values: &mut [f32]) -> TransitionRowMut<'_> {
         let (observation, rest) = values.split_at_mut(self.observation);
         let (next_observation, rest) = rest.split_at_mut(self.observation);
-        let (true_state, rest) = rest.split_at_mut(self.true_state);
-        let (next_true_state, rest) = rest.split_at_mut(self.true_state);
+        let (critic_state, rest) = rest.split_at_mut(self.critic_state);
+        let (next_true_state, rest) = rest.split_at_mut(self.critic_state);
         let (action, rest) = rest.split_at_mut(ACTION);
         let (reward, terminated) = rest.split_at_mut(1);
         TransitionRowMut {
             observation,
             next_observation,
-            true_state,
+            critic_state,
             next_true_state,
             action,
             reward: &mut reward[0],

@@ -74,7 +74,7 @@ struct UpdateBuffers {
     /// Gradient of the policy loss with respect to the two estimates of Q(s, a), `[rows, 2]`.
     drawn_grad: Vec<f32>,
     /// Gradient of the policy loss with respect to the drawn actions, through Q, `[rows, 2]`.
-    action_gradient: Vec<f32>,
+    action_grad: Vec<f32>,
     /// Policy activations for the current states s, `[rows, width]` per layer.
     policy: Layers,
     /// Gradient of the policy loss with respect to those activations.
@@ -212,7 +212,7 @@ impl NativeSac {
             joined,
             critic: activations,
             drawn_grad,
-            action_gradient,
+            action_grad,
             policy: policy_activations,
             policy_grad,
             ..
@@ -234,19 +234,13 @@ impl NativeSac {
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
         let action = self.inputs.critic..self.inputs.critic + ACTION;
-        self.critic.backward_through(
-            team,
-            critic,
-            activations,
-            drawn_grad,
-            action,
-            action_gradient,
-        );
+        self.critic
+            .backward_through(team, critic, activations, drawn_grad, action, action_grad);
         // Back through the drawn actions, then through the policy.
         sample.backward(
             *rows,
             temperature * share,
-            action_gradient,
+            action_grad,
             output_mut(policy_grad),
         );
         self.policy
@@ -274,7 +268,7 @@ impl NativeSac {
             critic: self.critic.allocate(rows),
             critic_grad: self.critic.allocate(rows),
             drawn_grad: numbers(rows, ESTIMATES),
-            action_gradient: numbers(rows, ACTION),
+            action_grad: numbers(rows, ACTION),
             policy: self.policy.allocate(rows),
             policy_grad: self.policy.allocate(rows),
         }

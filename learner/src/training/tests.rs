@@ -54,7 +54,7 @@ impl Training<'_> {
     fn skip_epoch(&mut self) {
         self.progress.epochs += 1;
         self.progress.episodes += self.config.learning.episodes_per_epoch;
-        self.publish_if_due(false).unwrap();
+        self.publish_if_due(0).unwrap();
     }
 
     /// Confirms the present snapshot as the best.
@@ -156,10 +156,9 @@ fn a_snapshot_follows_every_epoch_and_within_an_episode_every_update() {
     let run = BegunRun::new(|_| {});
     let mut training = run.begin();
     let mut versions = Vec::new();
-    for (is_mid_episode, is_updated) in [(false, false), (false, true), (true, false), (true, true)]
-    {
+    for (is_mid_episode, updates) in [(false, 0), (false, 1), (true, 0), (true, 1)] {
         training.open_episode = is_mid_episode.then(|| samples::episode(0, 1, Outcome::Collided));
-        training.publish_if_due(is_updated).unwrap();
+        training.publish_if_due(updates).unwrap();
         versions.push(training.progress.version().0);
     }
     assert_eq!(versions, [1, 2, 2, 3]);

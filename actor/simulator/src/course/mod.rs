@@ -196,8 +196,8 @@ impl Course {
         Ok(())
     }
 
-    /// Returns a course with the same walls in another order. `order[i]` is the present index of the
-    /// wall that becomes number `i`; the positions along x stay the same.
+    /// Returns a course with the same walls in another order. `order[i]` is the present index of
+    /// the wall that becomes number `i`; the positions along x stay the same.
     ///
     /// # Errors
     /// The first [`CourseFault`], from the first wall on: not every order leaves enough distance

@@ -132,7 +132,8 @@ impl Findings<'_> {
             return None;
         };
         Some(format!(
-            "A row \"difference to {0}\" is the arm's figure minus that of {0}, over the seeds that \
+            "A row \"difference to {0}\" is the arm's figure minus that of {0}, \
+             over the seeds that \
              both have completed. Its 95 % interval compares seed by seed: where it leaves out 0, \
              the arms differ.",
             first.label

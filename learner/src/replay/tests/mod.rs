@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{IMAGE_PIXELS, PRIVILEGED_STATE};
+use skein_protocol::{CRITIC_STATE, IMAGE_PIXELS};
 
 use super::*;
 use crate::episode::samples::{code, episode, shade, with_images};
@@ -246,10 +246,10 @@ fn rows_of_a_minibatch_belong_together() {
         );
         assert_eq!(batch.rewards[index], at / 100.0);
         for (states, seen) in [
-            (&batch.true_states, observation),
-            (&batch.next_true_states, next),
+            (&batch.critic_states, observation),
+            (&batch.next_critic_states, next),
         ] {
-            let state = &states[index * PRIVILEGED_STATE..][..PRIVILEGED_STATE];
+            let state = &states[index * CRITIC_STATE..][..CRITIC_STATE];
             assert_eq!(
                 state[17..19],
                 seen[LATENT..LATENT + 2],

@@ -106,7 +106,7 @@ impl Sample {
 
     /// Computes the gradient with respect to the policy network's output, `[rows, 4]`, for the rows
     /// after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to each
-    /// log π, and `action_gradient`, `[rows, 2]`, with respect to the actions.
+    /// log π, and `action_grad`, `[rows, 2]`, with respect to the actions.
     ///
     /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1; ∂x/∂log_std = std · noise; log_std
     /// also enters log π directly, ∂log π/∂log_std = -1. No gradient passes a bound of log_std.
@@ -114,13 +114,13 @@ impl Sample {
         &self,
         skipped: usize,
         log_prob_gradient: f32,
-        action_gradient: &[f32],
+        action_grad: &[f32],
         into: &mut [f32],
     ) {
         for (row, into) in into.chunks_exact_mut(OUTPUTS).enumerate() {
             for dimension in 0..ACTION {
                 let at = (skipped + row) * ACTION + dimension;
-                let by_action = action_gradient[row * ACTION + dimension];
+                let by_action = action_grad[row * ACTION + dimension];
                 let by_x = log_prob_gradient * 2.0 * self.actions[at] + by_action * self.slope[at];
                 into[dimension] = by_x;
                 let free = (LOG_STD.0..=LOG_STD.1).contains(&self.log_std[at]);

@@ -2,7 +2,7 @@
 
 use super::buffer::Buffer;
 use super::network::VaeNetwork;
-use super::order::LayerRanges;
+use super::parameter_order::LayerRanges;
 use super::unfold;
 
 /// Activations, and the gradients of the loss with respect to them, image by image, channels last.

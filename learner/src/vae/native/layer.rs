@@ -9,7 +9,7 @@ use skein_kernels::{
     Finish, Isa, Matrix, Panels, Rows, Start, Team, Terms, Windows, gradient, product, spread,
 };
 
-use super::order::LayerRanges;
+use super::parameter_order::LayerRanges;
 
 /// Stride of every kernel.
 pub(super) const STRIDE: usize = 2;

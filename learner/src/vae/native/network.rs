@@ -6,7 +6,7 @@ use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 
 use super::elementwise::{LANES, fill, rectify, scale};
 use super::layer::{ConvLayer, LinearLayer, STRIDE};
-use super::order::{LayerRanges, ParameterOrder};
+use super::parameter_order::{LayerRanges, ParameterOrder};
 use super::stopwatch::{Pass, Stopwatch};
 use super::unfold::{self, Unfold};
 

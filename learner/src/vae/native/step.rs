@@ -15,7 +15,7 @@ use super::elementwise::{column_sums, gate, reconstruction_error};
 use super::layer::ConvLayer;
 use super::members::{MemberScratch, by_image, portions, share};
 use super::network::{DECODER, HEADS, LINEAR, UNFOLD, VaeNetwork};
-use super::order::LayerRanges;
+use super::parameter_order::LayerRanges;
 use super::stopwatch::Pass;
 
 /// The loss and its parts; see [`super::super::VaeMetrics`].

@@ -13,7 +13,7 @@ use skein_kernels::{
 use super::buffer::Buffer;
 use super::elementwise::{fill, squares};
 use super::layer::STRIDE;
-use super::order::LayerRanges;
+use super::parameter_order::LayerRanges;
 
 /// Rows of the image and of the kernel: the input has one row, so kernel row k makes image row k
 /// and nothing else.
