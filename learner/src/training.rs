@@ -162,8 +162,8 @@ impl Training<'_> {
         self.publish_if_due(self.trainer.all_updates() - before)
     }
 
-    /// Publishes the next version, after so many `updates`. After a segment without any, the present
-    /// snapshot stays in use.
+    /// Publishes the next version, after so many `updates`. After a segment without any, the
+    /// present snapshot stays in use.
     fn publish_if_due(&mut self, updates: u64) -> Result<(), TrainingError> {
         if self.open_episode.is_some() && updates == 0 {
             return Ok(());

@@ -20,7 +20,7 @@ const UNUSED: [(&str, &str); 4] = [
     ),
 ];
 
-/// What an evaluation flies.
+/// Kind of what an evaluation flies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Flown {
     /// Courses, with the disturbances of the configuration.
