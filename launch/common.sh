@@ -44,7 +44,7 @@ build_evaluation() {
 # Builds what training needs.
 build_training() {
     "$repository/launch/setup.sh"
-    cargo_build "building learner, actor and supervisor, with libtorch (about 4 to 6 minutes on two cores the first time)" \
+    cargo_build "building learner, actor and supervisor, with libtorch (3 to 5 minutes on two cores the first time)" \
         --bin skein --bin skein-learner --bin skein-actor
 }
 
