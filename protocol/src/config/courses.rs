@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_course_is_shown_by_its_name_and_equal_names_are_told_apart() {
+    fn a_course_is_shown_by_its_name_and_equal_names_are_distinguished() {
         let folder = tempfile::tempdir().unwrap();
         let write = |file: &str, text: &str| {
             let path = folder.path().join(file);
