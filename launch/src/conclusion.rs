@@ -7,7 +7,7 @@ use serde::de::DeserializeOwned;
 use skein_protocol::config::EvaluationSection;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::stages::StageTimes;
-use skein_protocol::summary::{RunEnding, Summary, Trained};
+use skein_protocol::summary::{RunEnding, RunSummary, Trained};
 use skein_run::RunDirectory;
 use skein_run::tables::{evaluation_table, stages_table};
 
@@ -94,7 +94,7 @@ fn trained_sentence(trained: &Trained) -> String {
     )
 }
 
-fn sentence(summary: &Summary) -> String {
+fn sentence(summary: &RunSummary) -> String {
     let ending = match summary.ending {
         RunEnding::Completed => "Completed",
         RunEnding::Interrupted => "Interrupted",
@@ -184,7 +184,7 @@ mod tests {
         };
         let mut stages = StageTimes::default();
         stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));
-        let summary = Summary {
+        let summary = RunSummary {
             skein_version: "0".to_owned(),
             run: RunId(1),
             seed: 1,

@@ -16,7 +16,7 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
-use crate::networks::{Critic, Layout, Parameters, Policy};
+use crate::networks::{CriticNetwork, Layout, Parameters, PolicyNetwork};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::perception::{NextStateEncoder, Perception};
@@ -29,13 +29,13 @@ pub(crate) struct Td3 {
     inputs: Inputs,
     settings: Td3Section,
     device: Device,
-    policy: Policy,
+    policy: PolicyNetwork,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
     target_policy: Parameters,
     /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
-    critic: Critic,
+    critic: CriticNetwork,
     critic_parameters: Parameters,
     critic_optimizer: Adam,
     target_critic: Parameters,
@@ -46,7 +46,8 @@ impl Td3 {
     pub(crate) fn new(section: &Td3Section, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
-        let policy = Policy::with_outputs(&mut layout, inputs.policy as i64, width, ACTION as i64);
+        let policy =
+            PolicyNetwork::with_outputs(&mut layout, inputs.policy as i64, width, ACTION as i64);
         let policy_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 0),
@@ -56,7 +57,7 @@ impl Td3 {
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = Critic::describe(
+        let critic = CriticNetwork::describe(
             &mut layout,
             inputs.critic as i64,
             width,

@@ -26,7 +26,7 @@ use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::LearnerPhase;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{RunEnding, Summary};
+use skein_protocol::summary::{RunEnding, RunSummary};
 use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity};
 
@@ -100,7 +100,7 @@ pub fn run(
     incarnation: LearnerIncarnation,
     config: &Config,
     stop: &Arc<AtomicBool>,
-) -> Result<Summary, TrainingError> {
+) -> Result<RunSummary, TrainingError> {
     let mut training = Training::begin(directory, identity, incarnation, config, stop)?;
     let end = match training.train() {
         Ok(()) => training

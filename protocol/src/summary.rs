@@ -11,7 +11,7 @@ use crate::stages::StageTimes;
 
 /// Summary of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
+pub struct RunSummary {
     /// Version of Skein and, if known, the last commit that changed the learner:
     /// `0.1.0+b8735651a2c3`, with `-dirty` appended if the code was modified.
     pub skein_version: String,
@@ -52,11 +52,11 @@ pub struct Summary {
     pub tickets_reissued: u64,
     /// Records that were refused.
     pub records_refused: u64,
-    /// [`Summary::tickets_reissued`] by reason; reasons that did not occur
+    /// [`RunSummary::tickets_reissued`] by reason; reasons that did not occur
     /// are left out.
     #[serde(default)]
     pub reissued_by_reason: BTreeMap<String, u64>,
-    /// [`Summary::records_refused`] by reason; reasons that did not occur
+    /// [`RunSummary::records_refused`] by reason; reasons that did not occur
     /// are left out.
     #[serde(default)]
     pub refused_by_reason: BTreeMap<String, u64>,
@@ -76,7 +76,7 @@ pub struct Summary {
     pub thread_cpu_secs: BTreeMap<String, f64>,
 }
 
-impl Summary {
+impl RunSummary {
     /// Returns `true` if the run completed all episodes of `config`. One that was lengthened
     /// afterwards has more to fly.
     pub fn is_of_whole(&self, config: &Config) -> bool {
@@ -135,10 +135,10 @@ mod tests {
     fn a_saved_summary_is_loaded_and_a_damaged_one_is_no_summary() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("summary.json");
-        assert_eq!(Summary::load(&path), None);
+        assert_eq!(RunSummary::load(&path), None);
         let mut stages = StageTimes::default();
         stages.add(Stage::Publish, 3, Duration::from_millis(500));
-        let summary = Summary {
+        let summary = RunSummary {
             skein_version: "0.1.0".to_owned(),
             run: RunId(3),
             seed: 1,
@@ -171,9 +171,9 @@ mod tests {
             thread_cpu_secs: BTreeMap::from([("receiver".to_owned(), 0.25)]),
         };
         std::fs::write(&path, summary.to_json()).unwrap();
-        assert_eq!(Summary::load(&path), Some(summary));
+        assert_eq!(RunSummary::load(&path), Some(summary));
         std::fs::write(&path, "{").unwrap();
-        assert_eq!(Summary::load(&path), None);
+        assert_eq!(RunSummary::load(&path), None);
     }
 
     #[test]
@@ -186,6 +186,9 @@ mod tests {
             "vae_updates":400,"evaluation_episodes":400,"tickets_reissued":0,
             "records_refused":0,"wall_secs":333.3,"phase_secs":{"publish":12.5}}"#;
         std::fs::write(&path, short).unwrap();
-        assert_eq!(Summary::load(&path).unwrap().stages, StageTimes::default());
+        assert_eq!(
+            RunSummary::load(&path).unwrap().stages,
+            StageTimes::default()
+        );
     }
 }

@@ -3,7 +3,7 @@
 use std::fs;
 
 use serde::Deserialize;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::RunDirectory;
 
 /// Row of `episodes.csv`.
@@ -45,7 +45,7 @@ pub struct LearnedResults {
 }
 
 impl LearnedResults {
-    pub(crate) fn of(run: &RunDirectory, summary: &Summary) -> Self {
+    pub(crate) fn of(run: &RunDirectory, summary: &RunSummary) -> Self {
         let nobody = |episode| RecordedEpisode {
             actor: 0,
             ..episode

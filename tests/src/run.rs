@@ -11,7 +11,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde::de::DeserializeOwned;
 use skein_chaos::{ListedProcess, Role, compare, leftovers, processes_of};
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::signals::heed;
 use skein_run::{RunDirectory, sweep_leftovers};
 use tempfile::TempDir;
@@ -426,7 +426,7 @@ impl EndedRun {
     ///
     /// # Panics
     /// Panics if it is missing or malformed.
-    pub fn summary(&self) -> Summary {
+    pub fn summary(&self) -> RunSummary {
         json(self.directory.summary_json())
     }
 

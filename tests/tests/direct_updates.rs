@@ -90,7 +90,7 @@ fn a_stopped_run_completes_its_episode_and_loses_nothing() {
     run.until_episodes(25);
     run.signal(Signal::INT);
     run.until_ended();
-    let summary: skein_protocol::summary::Summary =
+    let summary: skein_protocol::summary::RunSummary =
         serde_json::from_slice(&std::fs::read(run.directory().summary_json()).unwrap()).unwrap();
     assert_eq!(summary.ending, RunEnding::Interrupted);
     assert!(summary.episodes >= 25, "{summary:?}");

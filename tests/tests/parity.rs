@@ -11,7 +11,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_inference::{ActionDistribution, Network, Scratch};
 use skein_kernels::Isa;
 use skein_learner::algorithm::{Algorithm, Inputs};
-use skein_learner::networks::{Layout, Parameters, Policy};
+use skein_learner::networks::{Layout, Parameters, PolicyNetwork};
 use skein_learner::sac::{NativeSac, TorchSac};
 use skein_learner::vae::{NativeVae, TorchVae as Vae, images_from_bytes};
 use skein_protocol::config::{Config, Observation};
@@ -112,7 +112,7 @@ fn the_native_policy_equals_the_learners() {
     for (seed, observation) in SEEDS.zip(OBSERVATIONS) {
         let config = config(observation);
         let mut layout = Layout::default();
-        let policy = Policy::describe(
+        let policy = PolicyNetwork::describe(
             &mut layout,
             config.observation_layout().len() as i64,
             config.sac.hidden_width as i64,
@@ -139,7 +139,7 @@ fn the_native_policy_equals_the_learners() {
 fn both_bound_an_extreme_standard_deviation_alike() {
     let config = config(Observation::Latent);
     let mut layout = Layout::default();
-    let policy = Policy::describe(
+    let policy = PolicyNetwork::describe(
         &mut layout,
         config.observation_layout().len() as i64,
         config.sac.hidden_width as i64,

@@ -10,7 +10,7 @@ use std::fs;
 
 use rustix::process::Signal;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_tests::{EndedRun, RunRecipe};
 
 fn end_to_end(algorithm: &str) -> RunRecipe {
@@ -36,7 +36,7 @@ fn without_a_vae_a_run_killed_and_resumed_with_more_actors_learns_the_same_bit_f
         "{}",
         learners_log(&calm)
     );
-    let Summary {
+    let RunSummary {
         updates,
         vae_updates,
         ..

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 
 use super::definition::{Axis, Measure};
 use super::plan::{ExperimentPlan, PlannedRun, RunState};
@@ -22,7 +22,7 @@ pub struct RunResult {
     /// Its seed.
     pub seed: u64,
     /// Its counts and times.
-    pub summary: Summary,
+    pub summary: RunSummary,
     /// Evaluation of its best snapshot.
     pub evaluation: EvaluationReport,
     /// Evaluation of its best snapshot in the experiment's suite, if there is one and it was flown.

@@ -167,30 +167,30 @@ fn pixels_per_metre(course: &Course) -> f32 {
     along.min(HIGHEST_PANEL as f32 / corridor.width_m.max(corridor.height_m))
 }
 
-fn panel_height(course: &Course, view: Projection) -> u32 {
+fn panel_height(course: &Course, view: ViewedFrom) -> u32 {
     let (low, high) = view.range_m(course);
     ((high - low) * pixels_per_metre(course)) as u32
 }
 
 fn block_height(course: &Course) -> u32 {
     CAPTION
-        + panel_height(course, Projection::Above)
+        + panel_height(course, ViewedFrom::Above)
         + PANEL_GAP
-        + panel_height(course, Projection::Side)
+        + panel_height(course, ViewedFrom::Side)
         + AXIS
         + FrontViews::of(course, pixels_per_metre(course)).height()
 }
 
-/// Projection of the corridor.
+/// Side from which a panel shows the corridor.
 #[derive(Clone, Copy)]
-enum Projection {
+enum ViewedFrom {
     /// From above: x to the right, y (left of the drone) up.
     Above,
     /// From the side: x to the right, z up.
     Side,
 }
 
-impl Projection {
+impl ViewedFrom {
     fn range_m(self, course: &Course) -> (f32, f32) {
         let corridor = course.corridor();
         match self {
@@ -256,7 +256,7 @@ impl Projection {
 /// Position of one panel in drawn pixels.
 struct Panel<'a> {
     course: &'a Course,
-    view: Projection,
+    view: ViewedFrom,
     top: u32,
 }
 
@@ -438,13 +438,13 @@ fn draw_course(
     )?;
     let above = Panel {
         course,
-        view: Projection::Above,
+        view: ViewedFrom::Above,
         top: top + CAPTION,
     };
     let side = Panel {
         course,
-        view: Projection::Side,
-        top: above.top + panel_height(course, Projection::Above) + PANEL_GAP,
+        view: ViewedFrom::Side,
+        top: above.top + panel_height(course, ViewedFrom::Above) + PANEL_GAP,
     };
     above.draw(area, episodes)?;
     side.draw(area, episodes)?;
@@ -453,7 +453,7 @@ fn draw_course(
         let (x, y) = side.at(x_m as f32, 0.0);
         area.draw_text(&format!("{x_m} m"), &centred, (x, y + px(5) as i32))?;
     }
-    let below = side.top + panel_height(course, Projection::Side) + AXIS;
+    let below = side.top + panel_height(course, ViewedFrom::Side) + AXIS;
     FrontViews::of(course, pixels_per_metre(course)).draw(area, episodes, below)
 }
 

@@ -3,17 +3,17 @@
 use skein_protocol::ACTION;
 use tch::Tensor;
 
-use super::{Layout, Linear, Parameters};
+use super::{Layout, LinearLayer, Parameters};
 
 /// Three fully connected layers with ReLU between. Either one network whose last layer gives two
 /// estimates of Q (the paper, section 3.4), or two networks with one estimate each
 /// (arXiv:1812.05905), whose errors are less correlated. The smaller estimate is the one used.
 #[derive(Debug, Clone)]
-pub struct Critic {
-    networks: Vec<[Linear; 3]>,
+pub struct CriticNetwork {
+    networks: Vec<[LinearLayer; 3]>,
 }
 
-impl Critic {
+impl CriticNetwork {
     /// Describes the layers of `networks`, one or two.
     pub fn describe(
         layout: &mut Layout,
@@ -23,7 +23,7 @@ impl Critic {
     ) -> Self {
         let mut network = |name: &str| {
             let mut layer = |number: u8, inputs, outputs| {
-                Linear::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
+                LinearLayer::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
             };
             [
                 layer(1, observation + ACTION as i64, hidden_width),

@@ -5,7 +5,7 @@ use skein_protocol::config::DecoderName;
 
 use tch::Tensor;
 
-use super::{Layout, Linear, Parameters, TransposedConvolution};
+use super::{Layout, LinearLayer, Parameters, TransposedConvolutionLayer};
 
 /// A linear layer to 1024 × 1 × 3, then four transposed convolutions with stride 2, whose kernels
 /// give 72 × 128 exactly (the paper, section 3.3; channels as in arXiv:1803.10122). ReLU between, a
@@ -18,18 +18,18 @@ use super::{Layout, Linear, Parameters, TransposedConvolution};
 /// code towards the prior, at its usual weight, so the code may end up empty. The policy sees only
 /// the code. The comparison of both decoders measures what that costs.
 #[derive(Debug, Clone, Copy)]
-pub struct Decoder {
-    unfold: Linear,
-    convolutions: [TransposedConvolution; 4],
+pub struct DecoderNetwork {
+    unfold: LinearLayer,
+    convolutions: [TransposedConvolutionLayer; 4],
     name: DecoderName,
 }
 
-impl Decoder {
+impl DecoderNetwork {
     /// Describes the layers, for latent codes of `latent` numbers.
     pub fn describe(layout: &mut Layout, latent: usize, name: DecoderName) -> Self {
-        let unfold = Linear::describe(layout, "decoder.linear", latent as i64, 1024 * 3);
+        let unfold = LinearLayer::describe(layout, "decoder.linear", latent as i64, 1024 * 3);
         let mut convolution = |number: usize, inputs: i64, outputs: i64, kernel: [i64; 2]| {
-            TransposedConvolution::describe(
+            TransposedConvolutionLayer::describe(
                 layout,
                 &format!("decoder.conv{number}"),
                 inputs,

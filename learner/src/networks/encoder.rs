@@ -4,7 +4,7 @@ use skein_protocol::snapshot::{ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNE
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH};
 use tch::{Kind, Tensor};
 
-use super::{Convolution, Layout, Linear, Parameters};
+use super::{ConvolutionLayer, Layout, LinearLayer, Parameters};
 
 /// Bound on the magnitude of the log-variance: standard deviations from 0.0067 to 148. Trained
 /// encoders stay far inside it (the prior's standard deviation is 1), and the exponential cannot
@@ -16,8 +16,8 @@ pub const LOG_VARIANCE_BOUND: f64 = 10.0;
 /// whatever trains it.
 #[derive(Debug, Clone, Copy)]
 pub struct ImageEncoder {
-    convolutions: [Convolution; 4],
-    mean: Linear,
+    convolutions: [ConvolutionLayer; 4],
+    mean: LinearLayer,
 }
 
 impl ImageEncoder {
@@ -29,7 +29,7 @@ impl ImageEncoder {
                 ENCODER_CHANNELS[index + 1] as i64,
             ];
             let kernel = [ENCODER_KERNEL as i64; 2];
-            Convolution::describe(
+            ConvolutionLayer::describe(
                 layout,
                 &format!("encoder.conv{}", index + 1),
                 inputs,
@@ -37,7 +37,7 @@ impl ImageEncoder {
                 kernel,
             )
         });
-        let mean = Linear::describe(
+        let mean = LinearLayer::describe(
             layout,
             "encoder.mean",
             ENCODER_FEATURES as i64,
@@ -68,9 +68,9 @@ impl ImageEncoder {
 ///
 /// The mean head comes first, so that the part actors need is a prefix of the parameter vector.
 #[derive(Debug, Clone, Copy)]
-pub struct Encoder {
+pub struct EncoderNetwork {
     published: ImageEncoder,
-    log_variance: Linear,
+    log_variance: LinearLayer,
     published_len: usize,
 }
 
@@ -86,7 +86,7 @@ pub struct Encoded {
     pub maps: [Tensor; 3],
 }
 
-impl Encoder {
+impl EncoderNetwork {
     /// Describes the part that actors need, convolutions and mean head, then the log-variance head.
     /// Each head outputs `latent` numbers.
     pub fn describe(layout: &mut Layout, latent: usize) -> Self {
@@ -94,7 +94,7 @@ impl Encoder {
         let published_len = layout.len();
         Self {
             published,
-            log_variance: Linear::describe(
+            log_variance: LinearLayer::describe(
                 layout,
                 "encoder.log_variance",
                 ENCODER_FEATURES as i64,

@@ -29,9 +29,9 @@ impl LayerTensors {
 
 /// A fully connected layer.
 #[derive(Debug, Clone, Copy)]
-pub struct Linear(LayerTensors);
+pub struct LinearLayer(LayerTensors);
 
-impl Linear {
+impl LinearLayer {
     /// Describes a layer with weight `[outputs, inputs]`.
     pub fn describe(layout: &mut Layout, name: &str, inputs: i64, outputs: i64) -> Self {
         Self(LayerTensors::describe(
@@ -53,9 +53,9 @@ impl Linear {
 
 /// A convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct Convolution(LayerTensors);
+pub struct ConvolutionLayer(LayerTensors);
 
-impl Convolution {
+impl ConvolutionLayer {
     /// Describes a layer with weight `[outputs, inputs, height, width]`.
     pub fn describe(
         layout: &mut Layout,
@@ -84,9 +84,9 @@ impl Convolution {
 
 /// A transposed convolution with stride 2 and no padding.
 #[derive(Debug, Clone, Copy)]
-pub struct TransposedConvolution(LayerTensors);
+pub struct TransposedConvolutionLayer(LayerTensors);
 
-impl TransposedConvolution {
+impl TransposedConvolutionLayer {
     /// Describes a layer with weight `[inputs, outputs, height, width]`.
     pub fn describe(
         layout: &mut Layout,

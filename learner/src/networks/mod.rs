@@ -13,9 +13,9 @@ mod layers;
 pub mod native;
 mod policy;
 
-pub use critic::Critic;
-pub use decoder::Decoder;
-pub use encoder::{Encoded, Encoder, ImageEncoder, LOG_VARIANCE_BOUND, pixels};
+pub use critic::CriticNetwork;
+pub use decoder::DecoderNetwork;
+pub use encoder::{Encoded, EncoderNetwork, ImageEncoder, LOG_VARIANCE_BOUND, pixels};
 pub use flat::{Layout, ParameterSpec, Parameters};
-pub use layers::{Convolution, Linear, TransposedConvolution};
-pub use policy::{Policy, PolicySample};
+pub use layers::{ConvolutionLayer, LinearLayer, TransposedConvolutionLayer};
+pub use policy::{PolicyNetwork, PolicySample};

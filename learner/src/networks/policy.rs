@@ -5,14 +5,14 @@ use std::f64::consts::{LN_2, PI};
 use skein_protocol::{ACTION, LOG_STD};
 use tch::Tensor;
 
-use super::{Layout, Linear, Parameters};
+use super::{Layout, LinearLayer, Parameters};
 
 /// Four fully connected layers with ReLU between (the paper, section 3.4). The last one gives mean
 /// and log standard deviation of a Gaussian, which tanh squashes into the action (arXiv:1812.05905,
 /// appendix C).
 #[derive(Debug, Clone, Copy)]
-pub struct Policy {
-    layers: [Linear; 4],
+pub struct PolicyNetwork {
+    layers: [LinearLayer; 4],
 }
 
 /// Actions drawn from the policy.
@@ -24,7 +24,7 @@ pub struct PolicySample {
     pub log_prob: Tensor,
 }
 
-impl Policy {
+impl PolicyNetwork {
     /// Describes the layers of a stochastic policy: its outputs are means and log standard
     /// deviations.
     pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64) -> Self {
@@ -39,7 +39,7 @@ impl Policy {
         outputs: i64,
     ) -> Self {
         let mut layer = |number: usize, inputs: i64, outputs: i64| {
-            Linear::describe(layout, &format!("policy.layer{number}"), inputs, outputs)
+            LinearLayer::describe(layout, &format!("policy.layer{number}"), inputs, outputs)
         };
         Self {
             layers: [

@@ -28,7 +28,7 @@ use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output,
     output_mut, pair, smaller, squared_norm,
 };
-use crate::networks::{Critic, Layout, Policy};
+use crate::networks::{CriticNetwork, Layout, PolicyNetwork};
 use crate::noise::Noise;
 use crate::state::{StatePart, Stateful};
 
@@ -89,11 +89,11 @@ impl NativeSac {
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
-        Policy::describe(&mut policy_layout, inputs.policy as i64, width);
+        PolicyNetwork::describe(&mut policy_layout, inputs.policy as i64, width);
         let policy_values =
             policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        Critic::describe(
+        CriticNetwork::describe(
             &mut critic_layout,
             inputs.critic as i64,
             width,

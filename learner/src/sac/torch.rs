@@ -13,7 +13,7 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::batch::TensorBatch;
 use crate::error::{UpdateError, finite};
 use crate::metrics::Scalar;
-use crate::networks::{Critic, Layout, Parameters, Policy, PolicySample};
+use crate::networks::{CriticNetwork, Layout, Parameters, PolicyNetwork, PolicySample};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::perception::{NextStateEncoder, Perception};
@@ -23,12 +23,12 @@ use crate::state::{StatePart, Stateful};
 #[derive(Debug)]
 pub struct TorchSac {
     inputs: Inputs,
-    policy: Policy,
+    policy: PolicyNetwork,
     policy_parameters: Parameters,
     policy_optimizer: Adam,
     /// Encoder trained end to end, if there is one: its parameters lie before the critic's.
     perception: Option<Perception>,
-    critic: Critic,
+    critic: CriticNetwork,
     critic_parameters: Parameters,
     critic_optimizer: Adam,
     /// Parameters of the target critic Q̄: a slowly following average of the critic's, which
@@ -47,7 +47,7 @@ impl TorchSac {
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
-        let policy = Policy::describe(&mut layout, inputs.policy as i64, width);
+        let policy = PolicyNetwork::describe(&mut layout, inputs.policy as i64, width);
         let policy_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 0),
@@ -57,7 +57,7 @@ impl TorchSac {
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = Critic::describe(
+        let critic = CriticNetwork::describe(
             &mut layout,
             inputs.critic as i64,
             width,

@@ -12,7 +12,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, LearnerPhase};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
-use skein_protocol::summary::{RunEnding, Summary};
+use skein_protocol::summary::{RunEnding, RunSummary};
 use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
 
@@ -281,13 +281,13 @@ impl<'a> Training<'a> {
     pub(super) fn conclude(
         self,
         end: Result<(RunEnding, TrainingProgress), TrainingError>,
-    ) -> Result<Summary, TrainingError> {
+    ) -> Result<RunSummary, TrainingError> {
         // The times of a thread are gone once it has ended.
         let thread_cpu_secs = threads::cpu_secs();
         let written = self.checkpoints.finish();
         let summed_up = match (end, written) {
             (Ok((ending, progress)), Ok(())) => {
-                let summary = Summary {
+                let summary = RunSummary {
                     thread_cpu_secs,
                     ..summary(self.identity, self.config, ending, &progress, self.resumes)
                 };
@@ -308,7 +308,7 @@ impl<'a> Training<'a> {
 fn save_summary(
     directory: &RunDirectory,
     disk: &Disk,
-    summary: &Summary,
+    summary: &RunSummary,
 ) -> Result<(), TrainingError> {
     die_if_armed(FaultPoint::LearnerBeforeSummary);
     let path = directory.summary_json();
@@ -415,9 +415,9 @@ fn summary(
     ending: RunEnding,
     progress: &TrainingProgress,
     resumes: u64,
-) -> Summary {
+) -> RunSummary {
     let best = progress.best.as_ref();
-    Summary {
+    RunSummary {
         skein_version: env!("SKEIN_VERSION").to_owned(),
         run: identity.run,
         seed: config.run.seed,

@@ -32,7 +32,7 @@ use self::parameter_order::ParameterOrder;
 use self::step::{LossParts, StepContext};
 use super::VaeMetrics;
 use crate::error::UpdateError;
-use crate::networks::{Decoder, Encoder, Layout};
+use crate::networks::{DecoderNetwork, EncoderNetwork, Layout};
 use crate::noise::Noise;
 use crate::state::{StatePart, Stateful};
 
@@ -74,8 +74,8 @@ impl NativeVae {
 
     pub(crate) fn with_isa(section: &VaeSection, run_seed: u64, threads: usize, isa: Isa) -> Self {
         let mut layout = Layout::default();
-        let published_len = Encoder::describe(&mut layout, section.latent).published_len();
-        let _ = Decoder::describe(&mut layout, section.latent, DecoderName::Plain);
+        let published_len = EncoderNetwork::describe(&mut layout, section.latent).published_len();
+        let _ = DecoderNetwork::describe(&mut layout, section.latent, DecoderName::Plain);
         let order = ParameterOrder::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
         let len = initial.len();

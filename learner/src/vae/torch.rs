@@ -9,7 +9,7 @@ use tch::{Device, Kind, Tensor, no_grad_guard};
 
 use super::VaeMetrics;
 use crate::error::{UpdateError, finite};
-use crate::networks::{Decoder, Encoded, Encoder, Layout, Parameters, pixels};
+use crate::networks::{DecoderNetwork, Encoded, EncoderNetwork, Layout, Parameters, pixels};
 use crate::noise::Noise;
 use crate::optimizer::Adam;
 use crate::state::{StatePart, Stateful};
@@ -23,8 +23,8 @@ const CHUNK: i64 = 64;
 pub struct TorchVae {
     /// Length of the latent code.
     latent: i64,
-    encoder: Encoder,
-    decoder: Decoder,
+    encoder: EncoderNetwork,
+    decoder: DecoderNetwork,
     /// Parameters: the part that actors need, then the log-variance head, then the decoder.
     parameters: Parameters,
     optimizer: Adam,
@@ -42,8 +42,8 @@ impl TorchVae {
     /// Returns an untrained VAE; its parameters depend on the run's seed alone.
     pub fn new(section: &VaeSection, run_seed: u64, device: Device) -> Self {
         let mut layout = Layout::default();
-        let encoder = Encoder::describe(&mut layout, section.latent);
-        let decoder = Decoder::describe(&mut layout, section.latent, section.decoder);
+        let encoder = EncoderNetwork::describe(&mut layout, section.latent);
+        let decoder = DecoderNetwork::describe(&mut layout, section.latent, section.decoder);
         let parameters =
             Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
         let optimizer = Adam::new(parameters.flat(), section.learning_rate);

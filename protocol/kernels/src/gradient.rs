@@ -131,7 +131,7 @@ struct GradientJob<'a> {
 
 /// Working memory of one thread, kept from call to call.
 #[derive(Default)]
-struct Scratch {
+struct GradientScratch {
     left: Aligned,
     right: Aligned,
     /// Offset of each term's row in the right operand.
@@ -139,7 +139,7 @@ struct Scratch {
 }
 
 thread_local! {
-    static SCRATCH: RefCell<Scratch> = RefCell::default();
+    static SCRATCH: RefCell<GradientScratch> = RefCell::default();
 }
 
 impl GradientJob<'_> {
@@ -182,7 +182,7 @@ impl GradientJob<'_> {
 unsafe fn do_block(
     job: &GradientJob<'_>,
     terms: Range<usize>,
-    scratch: &mut Scratch,
+    scratch: &mut GradientScratch,
     begin: Begin,
 ) {
     // SAFETY: guaranteed by the caller.
@@ -199,14 +199,24 @@ unsafe fn do_block(
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma,avx512f,avx512vl,avx512bw,avx512dq")]
-unsafe fn avx512(job: &GradientJob<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+unsafe fn avx512(
+    job: &GradientJob<'_>,
+    terms: Range<usize>,
+    scratch: &mut GradientScratch,
+    begin: Begin,
+) {
     // SAFETY: guaranteed by the caller.
     unsafe { block::<Avx512>(job, terms, scratch, begin) }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,fma")]
-unsafe fn avx2(job: &GradientJob<'_>, terms: Range<usize>, scratch: &mut Scratch, begin: Begin) {
+unsafe fn avx2(
+    job: &GradientJob<'_>,
+    terms: Range<usize>,
+    scratch: &mut GradientScratch,
+    begin: Begin,
+) {
     // SAFETY: guaranteed by the caller.
     unsafe { block::<Avx2>(job, terms, scratch, begin) }
 }
@@ -215,7 +225,7 @@ unsafe fn avx2(job: &GradientJob<'_>, terms: Range<usize>, scratch: &mut Scratch
 unsafe fn block<S: Simd>(
     job: &GradientJob<'_>,
     terms: Range<usize>,
-    scratch: &mut Scratch,
+    scratch: &mut GradientScratch,
     begin: Begin,
 ) {
     let (count, rows) = (terms.len(), job.left.columns());

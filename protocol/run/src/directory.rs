@@ -67,7 +67,7 @@ impl RunDirectory {
         evaluation_trajectories_csv => "evaluation_trajectories.csv",
         /// Depth images and their reconstructions: `depth` and `reconstruction`, u8 `[n, 72, 128]`.
         reconstructions => "reconstructions.safetensors",
-        /// [`Summary`](skein_protocol::summary::Summary).
+        /// [`RunSummary`](skein_protocol::summary::RunSummary).
         summary_json => "summary.json",
         /// PNG files.
         plots => "plots",

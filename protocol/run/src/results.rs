@@ -5,7 +5,7 @@ use std::path::Path;
 
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::{Snapshot, SnapshotError, SnapshotLayout};
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 
 use crate::{RunDirectory, durable};
 
@@ -27,15 +27,15 @@ pub fn save_snapshot(
 
 impl RunDirectory {
     /// Returns the run's summary; `None` if there is none, or it cannot be read.
-    pub fn summary(&self) -> Option<Summary> {
-        Summary::load(&self.summary_json())
+    pub fn summary(&self) -> Option<RunSummary> {
+        RunSummary::load(&self.summary_json())
     }
 
     /// Writes the run's summary.
     ///
     /// # Errors
     /// Errors of the file system.
-    pub fn save_summary(&self, summary: &Summary) -> io::Result<()> {
+    pub fn save_summary(&self, summary: &RunSummary) -> io::Result<()> {
         durable::replace(&self.summary_json(), summary.to_json().as_bytes())
     }
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use serde_json::json;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::RunDirectory;
 
 /// Settings of every run: nothing is learned, and hardly anything evaluated.
@@ -48,7 +48,7 @@ fn main() {
 }
 
 /// Runs `episodes` in epochs of `length`.
-fn run(episodes: u64, length: u64) -> Summary {
+fn run(episodes: u64, length: u64) -> RunSummary {
     let folder = tempfile::tempdir().expect("there is room for a run");
     let directory = folder.path().join("run");
     let mut command = Command::new(skein());

@@ -85,28 +85,28 @@ fn read_file(bytes: &[u8], curves: &mut Curves) -> Result<(), (usize, String)> {
     Ok(())
 }
 
-fn take_event(rest: &mut &[u8]) -> Result<Event, String> {
+fn take_event(rest: &mut &[u8]) -> Result<CurveEvent, String> {
     let (message, after) = split_event_record(rest).map_err(|error| error.to_string())?;
     *rest = after;
-    Event::decode(message).map_err(|error| error.to_string())
+    CurveEvent::decode(message).map_err(|error| error.to_string())
 }
 
 #[derive(Clone, PartialEq, Message)]
-struct Event {
+struct CurveEvent {
     #[prost(int64, tag = "2")]
     step: i64,
     #[prost(message, optional, tag = "5")]
-    summary: Option<Summary>,
+    summary: Option<CurveSummary>,
 }
 
 #[derive(Clone, PartialEq, Message)]
-struct Summary {
+struct CurveSummary {
     #[prost(message, repeated, tag = "1")]
-    value: Vec<Value>,
+    value: Vec<CurveValue>,
 }
 
 #[derive(Clone, PartialEq, Message)]
-struct Value {
+struct CurveValue {
     #[prost(string, tag = "1")]
     tag: String,
     #[prost(float, optional, tag = "2")]
@@ -123,12 +123,12 @@ pub(super) mod samples {
     pub(crate) fn file(points: &[(&str, i64, f32)]) -> Vec<u8> {
         let mut bytes = Vec::new();
         for &(tag, step, value) in points {
-            let value = Value {
+            let value = CurveValue {
                 tag: tag.to_owned(),
                 simple_value: Some(value),
             };
-            let summary = Some(Summary { value: vec![value] });
-            let message = Event { step, summary }.encode_to_vec();
+            let summary = Some(CurveSummary { value: vec![value] });
+            let message = CurveEvent { step, summary }.encode_to_vec();
             write_event_record(&mut bytes, &message).expect("a vector takes all bytes");
         }
         bytes

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use csv::StringRecord;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
 
@@ -60,7 +60,7 @@ pub fn compare(calm: &RunDirectory, other: &RunDirectory) -> Vec<OutcomeCheck> {
         .collect()
 }
 
-fn summary(run: &RunDirectory) -> Result<Summary, String> {
+fn summary(run: &RunDirectory) -> Result<RunSummary, String> {
     let path = run.summary_json();
     let text = fs::read_to_string(&path).map_err(|error| format!("{}: {error}", path.display()))?;
     serde_json::from_str(&text).map_err(|error| format!("{}: {error}", path.display()))
@@ -81,7 +81,7 @@ fn policies(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String>
 }
 
 fn summaries(calm: &RunDirectory, other: &RunDirectory) -> Result<String, String> {
-    let learned = |of: &Summary| {
+    let learned = |of: &RunSummary| {
         format!(
             "{:?}: {} episodes, {} steps, {} updates, {} VAE updates, version {}, \
                  best {:?} with {:?} walls passed",

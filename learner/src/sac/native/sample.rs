@@ -1,6 +1,6 @@
 //! Actions drawn from the policy, their log-probability, and the gradients through both.
 //!
-//! Element by element, these are the functions of [`crate::networks::Policy`] and their
+//! Element by element, these are the functions of [`crate::networks::PolicyNetwork`] and their
 //! derivatives.
 
 use std::f32::consts::LN_2;

@@ -9,13 +9,13 @@ const LINE: usize = 16;
 
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C, align(64))]
-struct CacheLine([f32; LINE]);
+struct BufferLine([f32; LINE]);
 
 /// A buffer of numbers, aligned to a cache line and reused. Loading a vector register across two
 /// lines takes twice the time.
 #[derive(Debug, Default)]
 pub(super) struct Buffer {
-    lines: Vec<CacheLine>,
+    lines: Vec<BufferLine>,
     len: usize,
 }
 
@@ -33,7 +33,7 @@ impl Buffer {
     pub(super) fn resize(&mut self, len: usize) {
         let lines = len.div_ceil(LINE);
         if self.lines.len() < lines {
-            self.lines.resize(lines, CacheLine::zeroed());
+            self.lines.resize(lines, BufferLine::zeroed());
         }
         self.len = len;
     }

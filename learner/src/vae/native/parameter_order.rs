@@ -178,13 +178,13 @@ mod tests {
     use skein_protocol::config::DecoderName;
 
     use super::*;
-    use crate::networks::{Decoder, Encoder};
+    use crate::networks::{DecoderNetwork, EncoderNetwork};
 
     fn order(latent: usize) -> (ParameterOrder, usize) {
         let mut layout = Layout::default();
         let _ = (
-            Encoder::describe(&mut layout, latent),
-            Decoder::describe(&mut layout, latent, DecoderName::Plain),
+            EncoderNetwork::describe(&mut layout, latent),
+            DecoderNetwork::describe(&mut layout, latent, DecoderName::Plain),
         );
         (ParameterOrder::of(&layout), layout.len())
     }

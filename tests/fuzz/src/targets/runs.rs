@@ -11,7 +11,7 @@ use skein_protocol::config::Config;
 use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::ProgressReport;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_protocol::transition::Outcome;
 use skein_run::{Announcement, LearnerIncarnation, RunDirectory, RunIdentity};
 
@@ -133,7 +133,7 @@ fn result_samples() -> Vec<Vec<u8>> {
         "evaluation_episodes":400,"tickets_reissued":0,"records_refused":0,"wall_secs":333.3,
         "stages":[{"thread":"actors","stage":"physics","count":42000,"secs":12.5},
             {"thread":"training","stage":"idle","count":80,"secs":200.0}]}"#;
-    let read: Summary = serde_json::from_str(summary).unwrap();
+    let read: RunSummary = serde_json::from_str(summary).unwrap();
     let written = serde_json::to_vec(&read).unwrap();
     vec![
         tagged(0, &serde_json::to_vec(&report).unwrap()),

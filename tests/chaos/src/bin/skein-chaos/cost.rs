@@ -4,7 +4,7 @@
 use anyhow::{Context, Result};
 use skein_protocol::config::Config;
 use skein_protocol::stages::Stage;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::show;
 
 use crate::stage::Recipe;
@@ -17,8 +17,8 @@ const TOLERANCE: f64 = 0.03;
 #[derive(Debug)]
 pub(crate) struct CheckpointCost {
     every_episodes: u64,
-    with: Vec<Summary>,
-    without: Vec<Summary>,
+    with: Vec<RunSummary>,
+    without: Vec<RunSummary>,
 }
 
 impl CheckpointCost {
@@ -30,7 +30,7 @@ impl CheckpointCost {
     pub(crate) fn measure(
         recipe: &Recipe,
         times: u32,
-        train: impl Fn(&str, &Recipe) -> Result<Summary>,
+        train: impl Fn(&str, &Recipe) -> Result<RunSummary>,
     ) -> Result<Self> {
         let config = Config::load(&recipe.config, &recipe.overrides)?;
         let mut bare = recipe.clone();
@@ -56,7 +56,7 @@ impl CheckpointCost {
 
     /// Prints the costs. Returns `true` if they are within the tolerance.
     pub(crate) fn print(&self) -> bool {
-        let wall = |summary: &Summary| summary.wall_secs;
+        let wall = |summary: &RunSummary| summary.wall_secs;
         let (with, without) = (median_of(&self.with, wall), median_of(&self.without, wall));
         let slower = with / without - 1.0;
         let cpu = |name: &'static str| {
@@ -104,6 +104,6 @@ impl CheckpointCost {
     }
 }
 
-fn median_of(summaries: &[Summary], value: impl Fn(&Summary) -> f64) -> f64 {
+fn median_of(summaries: &[RunSummary], value: impl Fn(&RunSummary) -> f64) -> f64 {
     median(summaries.iter().map(value).collect())
 }

@@ -20,7 +20,7 @@ use anyhow::{Context, Result, bail};
 use clap::Parser;
 use skein_chaos::{compare, leftovers};
 use skein_protocol::config::Config;
-use skein_protocol::summary::Summary;
+use skein_protocol::summary::RunSummary;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
 use skein_run::note;
@@ -311,13 +311,13 @@ fn train_undisturbed(
     Ok(stage.run)
 }
 
-fn summary(run: &RunDirectory) -> Result<Summary> {
+fn summary(run: &RunDirectory) -> Result<RunSummary> {
     let path = run.summary_json();
     let context = || format!("cannot read {}: the run may be incomplete", path.display());
     serde_json::from_slice(&fs::read(&path).with_context(context)?).with_context(context)
 }
 
-fn planning(arguments: &Arguments, config: &Config, calm: &Summary) -> PlannedScript {
+fn planning(arguments: &Arguments, config: &Config, calm: &RunSummary) -> PlannedScript {
     let subject = Subject {
         episodes: config.run.episodes,
         episodes_per_epoch: config.learning.episodes_per_epoch,

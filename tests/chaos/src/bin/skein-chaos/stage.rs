@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, bail};
 use rustix::process::Signal;
 use skein_chaos::{ListedProcess, processes_of};
-use skein_protocol::summary::{RunEnding, Summary};
+use skein_protocol::summary::{RunEnding, RunSummary};
 use skein_run::RunDirectory;
 use skein_run::fault::FAULTS;
 use skein_run::orphans::signal_when_orphaned;
@@ -143,7 +143,7 @@ impl TestedRun {
     }
 
     /// Returns its summary, if it exists.
-    pub(crate) fn summary(&self) -> Option<Summary> {
+    pub(crate) fn summary(&self) -> Option<RunSummary> {
         serde_json::from_slice(&fs::read(self.run.summary_json()).ok()?).ok()
     }
 
