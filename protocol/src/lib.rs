@@ -7,6 +7,7 @@
 //! `skein-transport` carries the records; `skein-run` manages files and processes.
 
 pub mod config;
+pub mod encoder_file;
 pub mod evaluation;
 pub mod ids;
 pub mod progress;

@@ -16,13 +16,15 @@ mod td3;
 mod transport;
 mod vae;
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 use crate::segment::MAX_PRIOR_ACTIONS;
 
 pub use courses::CoursesSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
-pub use file::{ConfigError, failing_override};
+pub use file::{ConfigError, FILE_KEYS, failing_override};
 pub use learning::{
     AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
 };
@@ -73,6 +75,16 @@ impl Config {
             AlgorithmName::Sac => ("sac.batch_size", self.sac.batch_size),
             AlgorithmName::Td3 => ("td3.batch_size", self.td3.batch_size),
         }
+    }
+
+    /// Returns every file that the configuration names.
+    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
+        self.courses.paths().chain(&self.vae.start_from)
+    }
+
+    /// Returns every file that the configuration names, mutable.
+    pub fn files_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
+        self.courses.paths_mut().chain(&mut self.vae.start_from)
     }
 
     /// Returns the layout of the policy's observation.
@@ -151,6 +163,15 @@ impl Config {
             "does not go with learning.encoder = \"end-to-end\", where there is no VAE: set it \
             to \"plain\", or learning.encoder to \"vae\"",
         )?;
+        if let Some(file) = &self.vae.start_from {
+            require(
+                !end_to_end,
+                "vae.start_from",
+                format!("\"{}\"", file.display()),
+                "does not go with learning.encoder = \"end-to-end\", which trains an encoder of \
+                its own: leave it out, or set learning.encoder to \"vae\"",
+            )?;
+        }
         require(
             !end_to_end || self.replay.capacity <= MAX_CAPACITY_WITH_IMAGES,
             "replay.capacity",
