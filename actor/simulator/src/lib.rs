@@ -17,6 +17,7 @@
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
 //! | [`oracle`] | a scripted expert that knows the course |
+//! | [`viewpoints`] | depth images from random poses |
 
 pub mod camera;
 pub mod course;
@@ -28,4 +29,5 @@ mod step_report;
 pub mod suite;
 mod text;
 pub mod vehicle;
+pub mod viewpoints;
 mod world;

@@ -9,9 +9,9 @@
 //! rapier and parry use glam, the rest of this crate uses nalgebra: only this file converts between
 //! them.
 
-use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
 use rapier3d::dynamics::{MassProperties, RigidBodyBuilder, RigidBodyHandle};
-use rapier3d::math::Vector;
+use rapier3d::math::{Pose, Rotation, Vector};
 use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
 use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
 use rapier3d::pipeline::PhysicsWorld;
@@ -148,10 +148,21 @@ impl World {
         }
     }
 
+    /// Returns `true` if a body at `world_from_body` would touch no obstacle.
+    pub(crate) fn is_free_at(&self, world_from_body: &Isometry3<f32>) -> bool {
+        let [x, y, z, w] = world_from_body.rotation.coords.into();
+        let rotation = Rotation::from_xyzw(x, y, z, w);
+        let pose = Pose::from_parts(glam(&world_from_body.translation.vector), rotation);
+        !self.touches_from(&pose, &self.obstacles)
+    }
+
     fn touches(&self, surfaces: &TriMesh) -> bool {
-        let body_from_world = self.physics.bodies[self.body].position().inverse();
+        self.touches_from(self.physics.bodies[self.body].position(), surfaces)
+    }
+
+    fn touches_from(&self, world_from_body: &Pose, surfaces: &TriMesh) -> bool {
         DefaultQueryDispatcher
-            .intersection_test(&body_from_world, &self.body_shape, surfaces)
+            .intersection_test(&world_from_body.inverse(), &self.body_shape, surfaces)
             // Fails for unsupported shapes alone. A failure must never mean "no contact".
             .expect("parry tests a cuboid against a triangle mesh")
             .intersecting

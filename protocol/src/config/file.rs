@@ -246,6 +246,7 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     section(&mut table, "sac", &mut config.sac)?;
     section(&mut table, "td3", &mut config.td3)?;
     section(&mut table, "vae", &mut config.vae)?;
+    section(&mut table, "encoder", &mut config.encoder)?;
     section(&mut table, "replay", &mut config.replay)?;
     section(&mut table, "evaluation", &mut config.evaluation)?;
     section(&mut table, "checkpoints", &mut config.checkpoints)?;
@@ -255,7 +256,7 @@ fn from_table(mut table: Table) -> Result<Config, String> {
         None => Ok(config),
         Some(unknown) => Err(format!(
             "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, \
-            replay, evaluation, checkpoints, transport, simulator"
+            encoder, replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }

@@ -5,6 +5,7 @@
 //! and is passed on unread: this crate knows no physics.
 
 mod courses;
+mod encoder;
 mod evaluation;
 mod file;
 mod learning;
@@ -23,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use crate::segment::MAX_PRIOR_ACTIONS;
 
 pub use courses::CoursesSection;
+pub use encoder::EncoderSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, FILE_KEYS, failing_override};
 pub use learning::{
@@ -51,6 +53,8 @@ pub struct Config {
     pub td3: Td3Section,
     /// Variational auto-encoder.
     pub vae: VaeSection,
+    /// Encoder trained before any run.
+    pub encoder: EncoderSection,
     /// Split replay buffer.
     pub replay: ReplaySection,
     /// Evaluation episodes.
@@ -116,6 +120,7 @@ impl Config {
         self.sac.validate()?;
         self.td3.validate()?;
         self.vae.validate()?;
+        self.encoder.validate()?;
         self.replay.validate()?;
         self.evaluation.validate()?;
         self.checkpoints.validate()?;
