@@ -13,13 +13,7 @@
 use tch::{Tensor, no_grad_guard};
 
 use crate::batch::TensorBatch;
-use crate::networks::{ImageEncoder, Layout, Parameters};
-
-/// Factor by which initial weights exceed PyTorch's defaults. It keeps the variance of activations
-/// constant through layers with ReLU (He et al. 2015, arXiv:1502.01852, eq. 10). With the defaults,
-/// four layers shrink the difference between two images thirtyfold, and a critic that sees no
-/// difference trains nothing. (arXiv:1910.01741 uses orthogonal weights instead.)
-const WIDER: f32 = 2.449_489_7; // √6
+use crate::networks::{ImageEncoder, Layout, Parameters, WIDER};
 
 /// The encoder in a critic's parameter vector.
 #[derive(Debug, Clone, Copy)]
@@ -46,6 +40,7 @@ impl Perception {
     /// after it.
     pub(crate) fn describe(critic: &mut Layout, latent: usize) -> Self {
         let encoder = ImageEncoder::describe(critic, latent);
+        // A critic that sees no difference trains nothing. (arXiv:1910.01741 uses orthogonal weights.)
         critic.widen_weights(WIDER);
         Self {
             encoder,

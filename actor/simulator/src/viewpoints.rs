@@ -22,6 +22,8 @@ const OFF_THE_WAY_M: f32 = 0.5;
 /// Standard deviation of roll and pitch, radians. The oracle's roll and pitch are 0.02 and 0.01 root
 /// mean square; a policy that explores tilts more. Every vehicle keeps its nose along the corridor.
 const TILT_RAD: f32 = 0.03;
+/// Distance of a wall below which the edges of its opening leave the image, metres.
+const TOO_NEAR_M: f32 = 0.5;
 /// Positions tried in a cross-section before another one is drawn.
 const TRIES: u32 = 8;
 
@@ -33,11 +35,13 @@ pub struct Viewpoints {
     half_length_m: f32,
     /// Tangents of half the angles of view, horizontal and vertical.
     half_view: [f32; 2],
+    /// The camera's range, metres.
+    range_m: f32,
     noisy_share: f32,
 }
 
-/// Openings ahead of a viewpoint, if their safe point is in sight: the next wall's, and that of the
-/// wall behind it.
+/// Openings ahead of a viewpoint, if their safe point is in sight and within the camera's range: the
+/// next wall's, and that of the wall behind it.
 pub type OpeningsInSight = [Option<OpeningAhead>; 2];
 
 impl Viewpoints {
@@ -63,6 +67,7 @@ impl Viewpoints {
             camera: camera.with_noise(&settings.disturbances.depth),
             half_length_m: body.half_extents_m.x,
             half_view: settings.camera.half_view(),
+            range_m: settings.camera.range_m,
             noisy_share: settings.disturbances.share,
         })
     }
@@ -157,7 +162,10 @@ impl Viewpoints {
     }
 
     fn is_in_view(&self, opening: &OpeningAhead) -> bool {
-        (0..2).all(|axis| opening.offset_m[axis].abs() < opening.distance_m * self.half_view[axis])
+        (TOO_NEAR_M..self.range_m).contains(&opening.distance_m)
+            && (0..2).all(|axis| {
+                opening.offset_m[axis].abs() < opening.distance_m * self.half_view[axis]
+            })
     }
 }
 
@@ -221,6 +229,7 @@ mod tests {
         let [mut next, mut after] = [0, 0];
         for (_, _, openings) in &drawn {
             for opening in openings.iter().flatten() {
+                assert!((TOO_NEAR_M..20.0).contains(&opening.distance_m));
                 let [left, up] = opening.offset_m.map(f32::abs);
                 assert!(left < opening.distance_m && up < 0.5625 * opening.distance_m + 1e-3);
             }

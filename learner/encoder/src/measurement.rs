@@ -20,9 +20,9 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_simulator::course::GeneratedShape;
-use skein_simulator::simulator::SimulatorSettings;
+use skein_simulator::simulator::{OpeningAhead, SimulatorSettings};
 
-use crate::views::{KNOWN, OPENING, Views, in_metres, numbers_m};
+use crate::views::{FoundOpening, KNOWN, OPENING, Views};
 
 /// Views that the probe is trained on, and views of each row of the table.
 const TRAINING_VIEWS: usize = 16_000;
@@ -46,7 +46,7 @@ pub struct Measurement {
 /// Root mean square errors of one kind of view, metres.
 #[derive(Debug)]
 struct RowErrors {
-    /// Offset of the next opening, per axis, by distance.
+    /// Offset of the next opening at its true distance, per axis, by distance.
     offset_m: [f64; 3],
     /// Distance of the next wall, within the farthest band.
     distance_m: f64,
@@ -131,6 +131,9 @@ fn codes(encoder: &Encoder, latent: usize, team: &mut Team, images: &[u8]) -> Ve
     codes.flat_map(|code| code[..latent].to_vec()).collect()
 }
 
+/// Differences between an opening found and the true one, metres.
+type Differences = fn(&FoundOpening, &OpeningAhead) -> [f32; 2];
+
 /// A network from code to [`Views::known`].
 struct Probe {
     team: Team,
@@ -196,45 +199,32 @@ impl Probe {
         let values = &self.learned.values;
         self.dense
             .forward_through(&mut self.team, values, codes, &mut found);
-        let error = |which: usize, places: &[usize], [least_m, most_m]: [f32; 2]| {
-            let mut mean = SquareMean::default();
+        // Root mean square of some differences between the openings found and true.
+        let error = |which: usize, [least_m, most_m]: [f32; 2], differences: Differences| {
+            let mut squares = Vec::new();
             for (openings, found) in views.openings.iter().zip(found.chunks(KNOWN)) {
-                let Some(opening) = &openings[which] else {
-                    continue;
-                };
-                if (least_m..most_m).contains(&opening.distance_m) {
-                    for &place in places {
-                        let found_m = in_metres(place, found[which * OPENING + place]);
-                        mean.add(found_m - numbers_m(opening)[place]);
-                    }
+                let is_in_band =
+                    |opening: &&OpeningAhead| (least_m..most_m).contains(&opening.distance_m);
+                if let Some(opening) = openings[which].as_ref().filter(is_in_band) {
+                    let found = FoundOpening::of(&found[which * OPENING..]);
+                    let differences = differences(&found, opening);
+                    squares.extend(differences.map(|error| f64::from(error).powi(2)));
                 }
             }
-            mean.root()
+            (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
         };
+        let offset: Differences = |found, opening| {
+            [0, 1].map(|axis| found.direction[axis] * opening.distance_m - opening.offset_m[axis])
+        };
+        let distance: Differences = |found, opening| [found.distance_m - opening.distance_m; 2];
+        let clearance: Differences = |found, opening| [found.clearance_m - opening.clearance_m; 2];
         let all = [BANDS_M[0][0], BANDS_M[2][1]];
         RowErrors {
-            offset_m: BANDS_M.map(|band| error(0, &[1, 2], band)),
-            distance_m: error(0, &[0], all),
-            clearance_m: error(0, &[3], all),
-            after_offset_m: error(1, &[1, 2], [0.0, f32::INFINITY]),
+            offset_m: BANDS_M.map(|band| error(0, band, offset)),
+            distance_m: error(0, all, distance),
+            clearance_m: error(0, all, clearance),
+            after_offset_m: error(1, [0.0, f32::INFINITY], offset),
         }
-    }
-}
-
-#[derive(Default)]
-struct SquareMean {
-    sum: f64,
-    count: usize,
-}
-
-impl SquareMean {
-    fn add(&mut self, error: f32) {
-        self.sum += f64::from(error).powi(2);
-        self.count += 1;
-    }
-
-    fn root(&self) -> f64 {
-        (self.sum / self.count as f64).sqrt()
     }
 }
 

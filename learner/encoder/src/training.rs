@@ -191,8 +191,8 @@ impl<'a> Training<'a> {
 
 fn new_vae(config: &Config) -> NativeVae {
     let (run, weight) = (&config.run, config.encoder.geometry_weight);
-    NativeVae::new(&config.vae, run.seed, run.learner_threads)
-        .with_geometry(KNOWN, weight, run.seed)
+    let head = (KNOWN, weight);
+    NativeVae::supervised(&config.vae, run.seed, run.learner_threads, head)
 }
 
 /// Returns Adam's step size of the step after `step` steps: constant, and then falling linearly.

@@ -15,13 +15,14 @@ use skein_simulator::viewpoints::{OpeningsInSight, Viewpoints};
 /// Views of one course; the next ones are of another.
 const VIEWS_PER_COURSE: usize = 4;
 
-/// Numbers of an opening: distance, offset left and up, clearance.
+/// Numbers of an opening: logarithm of its distance, direction left and up, logarithm of its
+/// clearance. An error of direction is the same distance in the image wherever the opening is.
 pub const OPENING: usize = 4;
 /// Numbers known of a view: those of two openings.
 pub const KNOWN: usize = 2 * OPENING;
 
-/// Zero and unit of the numbers of an opening, metres: about their means and standard deviations.
-const SCALES_M: [(f32, f32); OPENING] = [(5.0, 3.0), (0.0, 1.0), (0.0, 1.0), (0.9, 0.15)];
+/// Zero and unit of these numbers: about their means and standard deviations.
+const SCALES: [(f32, f32); OPENING] = [(1.4, 0.7), (0.0, 0.3), (0.0, 0.2), (-0.1, 0.15)];
 
 /// Depth images and what is known of them.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -78,23 +79,43 @@ impl Views {
     }
 }
 
-/// Returns the numbers of an opening, metres.
-pub fn numbers_m(opening: &OpeningAhead) -> [f32; OPENING] {
-    let [left, up] = opening.offset_m;
-    [opening.distance_m, left, up, opening.clearance_m]
+/// An opening as found from a code.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FoundOpening {
+    /// Distance forward to the wall, metres.
+    pub distance_m: f32,
+    /// Offset left and up per metre of distance.
+    pub direction: [f32; 2],
+    /// Radius of the free space, metres.
+    pub clearance_m: f32,
 }
 
-/// Converts a scaled number of an opening back to metres.
-pub fn in_metres(place: usize, scaled: f32) -> f32 {
-    let (zero, unit) = SCALES_M[place];
-    zero + unit * scaled
+impl FoundOpening {
+    /// Reads an opening from scaled numbers, as many as [`OPENING`].
+    pub fn of(scaled: &[f32]) -> Self {
+        let number = |place: usize| {
+            let (zero, unit) = SCALES[place];
+            zero + unit * scaled[place]
+        };
+        Self {
+            distance_m: number(0).exp(),
+            direction: [number(1), number(2)],
+            clearance_m: number(3).exp(),
+        }
+    }
 }
 
 fn scaled(opening: Option<OpeningAhead>) -> [f32; OPENING] {
-    let numbers = opening.map(|opening| numbers_m(&opening));
+    let Some(opening) = opening else {
+        return [f32::NAN; OPENING];
+    };
+    let [left, up] = opening
+        .offset_m
+        .map(|offset_m| offset_m / opening.distance_m);
+    let numbers = [opening.distance_m.ln(), left, up, opening.clearance_m.ln()];
     std::array::from_fn(|place| {
-        let (zero, unit) = SCALES_M[place];
-        numbers.map_or(f32::NAN, |numbers| (numbers[place] - zero) / unit)
+        let (zero, unit) = SCALES[place];
+        (numbers[place] - zero) / unit
     })
 }
 
@@ -131,8 +152,11 @@ mod tests {
                     continue;
                 };
                 in_sight += 1;
-                for (place, number) in numbers_m(opening).into_iter().enumerate() {
-                    assert!((in_metres(place, known[place]) - number).abs() < 1e-5);
+                let found = FoundOpening::of(known);
+                assert!((found.distance_m - opening.distance_m).abs() < 1e-4);
+                assert!((found.clearance_m - opening.clearance_m).abs() < 1e-4);
+                for (direction, offset_m) in found.direction.iter().zip(opening.offset_m) {
+                    assert!((direction * opening.distance_m - offset_m).abs() < 1e-4);
                 }
             }
         }

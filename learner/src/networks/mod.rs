@@ -16,6 +16,7 @@ mod policy;
 pub use critic::CriticNetwork;
 pub use decoder::DecoderNetwork;
 pub use encoder::{Encoded, EncoderNetwork, ImageEncoder, LOG_VARIANCE_BOUND, pixels};
+pub(crate) use flat::WIDER;
 pub use flat::{Layout, ParameterSpec, Parameters};
 pub use layers::{ConvolutionLayer, LinearLayer, TransposedConvolutionLayer};
 pub use policy::{PolicyNetwork, PolicySample};

@@ -34,7 +34,7 @@ use self::parameter_order::ParameterOrder;
 use self::step::{LossParts, StepContext};
 use super::VaeMetrics;
 use crate::error::UpdateError;
-use crate::networks::{DecoderNetwork, EncoderNetwork, Layout};
+use crate::networks::{DecoderNetwork, EncoderNetwork, Layout, WIDER};
 use crate::noise::Noise;
 use crate::state::{StatePart, Stateful};
 
@@ -77,9 +77,42 @@ impl NativeVae {
         Self::with_isa(section, run_seed, threads, Isa::best())
     }
 
+    /// Returns an untrained VAE with a second head, which regresses `outputs` numbers from the code.
+    /// `weight`: factor of its squared error in the loss.
+    ///
+    /// The encoder's initial weights are wider than the defaults: with those, the head learns
+    /// nothing in the first hundreds of steps.
+    pub fn supervised(
+        section: &VaeSection,
+        run_seed: u64,
+        threads: usize,
+        (outputs, weight): (usize, f64),
+    ) -> Self {
+        let isa = Isa::best();
+        let seed = derive(run_seed, Purpose::VaeParameters, 1);
+        let head = GeometryHead::new(isa, section.latent, outputs, weight, seed);
+        Self {
+            geometry: Some(head),
+            ..Self::initialised(section, run_seed, threads, isa, WIDER)
+        }
+    }
+
     pub(crate) fn with_isa(section: &VaeSection, run_seed: u64, threads: usize, isa: Isa) -> Self {
+        Self::initialised(section, run_seed, threads, isa, 1.0)
+    }
+
+    /// Returns an untrained VAE without a second head. `wider`: factor of the encoder's initial
+    /// weights.
+    fn initialised(
+        section: &VaeSection,
+        run_seed: u64,
+        threads: usize,
+        isa: Isa,
+        wider: f32,
+    ) -> Self {
         let mut layout = Layout::default();
         let published_len = EncoderNetwork::describe(&mut layout, section.latent).published_len();
+        layout.widen_weights(wider);
         let _ = DecoderNetwork::describe(&mut layout, section.latent, DecoderName::Plain);
         let order = ParameterOrder::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
@@ -106,15 +139,6 @@ impl NativeVae {
         vae.parameters
             .copy_from_slice(&vae.order.arrange_from_pytorch(&initial));
         vae
-    }
-
-    /// Returns the same VAE with a second head, which regresses `outputs` numbers from the code.
-    /// `weight`: factor of its squared error in the loss.
-    pub fn with_geometry(mut self, outputs: usize, weight: f64, run_seed: u64) -> Self {
-        let seed = derive(run_seed, Purpose::VaeParameters, 1);
-        let head = GeometryHead::new(self.isa, self.network.latent(), outputs, weight, seed);
-        self.geometry = Some(head);
-        self
     }
 
     /// Sets Adam's step size from the next step on.

@@ -347,3 +347,65 @@ fn engines_agree_behind_their_common_face() {
     assert!(relative_distance(&native.2, &torch.2) < 1e-3);
     assert_eq!((native.3, torch.3), (1, 1));
 }
+
+fn supervised(weight: f64) -> NativeVae {
+    NativeVae::supervised(&with_latent(8), 1, 1, (2, weight))
+}
+
+#[test]
+fn a_supervised_encoder_tells_images_apart_from_the_start() {
+    let images = synthetic_bytes(2, 2);
+    let difference = |vae: &mut NativeVae| {
+        let codes = vae.encode(&images);
+        let (one, other) = codes.split_at(8);
+        let differences = one.iter().zip(other);
+        differences.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    let plain = difference(&mut NativeVae::new(&with_latent(8), 1, 1));
+    let wider = difference(&mut supervised(1.0));
+    assert!(wider > 10.0 * plain, "{wider}, {plain}");
+}
+
+#[test]
+fn the_second_head_learns_what_images_show() {
+    let images = synthetic_bytes(16, 3);
+    // Place of each opening.
+    const WIDTH: usize = skein_protocol::IMAGE_WIDTH;
+    let known: Vec<f32> = images
+        .chunks(IMAGE_PIXELS)
+        .flat_map(|image| {
+            let first = image.iter().position(|depth| *depth == 220).unwrap();
+            [first % WIDTH, first / WIDTH].map(|pixels| pixels as f32 / 30.0 - 1.0)
+        })
+        .collect();
+    let mut vae = supervised(100.0);
+    let targets = Targets {
+        clean: None,
+        geometry: &known,
+    };
+    let mut losses = (0..60).map(|step| {
+        let updated = vae.update_supervised(&images, targets, &mut Noise::new(step));
+        updated.unwrap().1
+    });
+    let first = losses.next().unwrap();
+    let last = losses.last().unwrap();
+    assert!(last < 0.25 * first, "from {first} to {last}");
+}
+
+#[test]
+fn a_supervised_vae_reproduces_the_clean_images() {
+    let (images, clean) = (synthetic_bytes(3, 2), synthetic_bytes(3, 7));
+    let known = [f32::NAN; 6];
+    let after = |clean| {
+        let mut vae = supervised(0.0);
+        let targets = Targets {
+            clean,
+            geometry: &known,
+        };
+        let updated = vae.update_supervised(&images, targets, &mut Noise::new(1));
+        (updated.unwrap().0, state(&mut vae))
+    };
+    let own = after(None);
+    assert!(after(Some(&images)) == own);
+    assert!(after(Some(&clean)).0.pixel_error != own.0.pixel_error);
+}

@@ -15,9 +15,9 @@ pub struct EncoderSection {
     /// Share of the steps, at the end, over which the learning rate falls linearly to zero; in
     /// (0, 1]. Default 0.5.
     pub decay_share: f64,
-    /// Factor of the second loss, at least 0: a small network finds distance, offset and clearance
-    /// of the openings in sight from the code, with this factor of its squared error. The numbers
-    /// are scaled to a standard deviation of about one. Default 100.
+    /// Factor of the second loss, at least 0: a small network finds distance, direction and
+    /// clearance of the openings in sight from the code, with this factor of its squared error. The
+    /// numbers are scaled to a standard deviation of about one. Default 100.
     pub geometry_weight: f64,
 }
 
