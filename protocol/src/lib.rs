@@ -21,7 +21,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary. It is an attribute of every
 /// service: a process of another version is refused when it opens one.
-pub const PROTOCOL_VERSION: u32 = 9;
+pub const PROTOCOL_VERSION: u32 = 10;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;

@@ -41,6 +41,8 @@ pub enum Purpose {
     Bootstrap = 13,
     /// Generated course of a confirmation episode; indexed by episode.
     ConfirmationCourse = 14,
+    /// Steps of an episode that the teacher flies; derived from the ticket's seed.
+    TeacherSteps = 15,
 }
 
 /// Returns the seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

@@ -106,6 +106,7 @@ impl SnapshotLayout {
     pub fn of(config: &Config) -> Self {
         let (hidden_width, head) = match config.learning.algorithm {
             AlgorithmName::Sac => (config.sac.hidden_width, PolicyHead::SquashedGaussian),
+            AlgorithmName::Distill => (config.distill.hidden_width, PolicyHead::SquashedGaussian),
             AlgorithmName::Td3 => (
                 config.td3.hidden_width,
                 PolicyHead::Noisy(config.td3.exploration_noise as f32),

@@ -336,6 +336,7 @@ mod tests {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: 1,
+            teacher_share: None,
             segment: None,
         }
     }

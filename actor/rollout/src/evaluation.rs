@@ -237,6 +237,7 @@ impl Evaluation<'_> {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
+            teacher_share: None,
             segment: None,
         };
         let mut memory = MemoryLink {

@@ -13,7 +13,7 @@ use super::CheckpointError;
 pub(super) const NAME: &str = "manifest.json";
 
 /// Version of the checkpoint format; changes whenever older checkpoints become unreadable.
-pub(super) const FORMAT: u32 = 7;
+pub(super) const FORMAT: u32 = 8;
 
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;

@@ -120,7 +120,7 @@ impl TrainingProgress {
 }
 
 /// Order of one epoch's episodes. With configuration and run, it determines their tickets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EpochOrder {
     /// Epoch.
     pub epoch: u64,
@@ -128,6 +128,8 @@ pub struct EpochOrder {
     pub policy_version: u64,
     /// Exploration of the episodes.
     pub exploration: Exploration,
+    /// Share of the steps that the teacher flies; `None` without a teacher.
+    pub teacher_share: Option<f32>,
     /// Data to keep of the episodes.
     pub keep: KeptData,
 }

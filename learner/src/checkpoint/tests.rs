@@ -53,6 +53,7 @@ fn state(episodes: u64) -> CheckpointState {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,
+                teacher_share: Some(0.5),
                 keep: KeptData::Depth,
             }],
             evaluations: 1,

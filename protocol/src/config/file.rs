@@ -244,6 +244,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     section(&mut table, "learning", &mut config.learning)?;
     section(&mut table, "sac", &mut config.sac)?;
     section(&mut table, "td3", &mut config.td3)?;
+    section(&mut table, "distill", &mut config.distill)?;
+    section(&mut table, "teacher", &mut config.teacher)?;
     section(&mut table, "vae", &mut config.vae)?;
     section(&mut table, "replay", &mut config.replay)?;
     section(&mut table, "evaluation", &mut config.evaluation)?;
@@ -253,8 +255,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     match table.keys().next() {
         None => Ok(config),
         Some(unknown) => Err(format!(
-            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, \
-            replay, evaluation, checkpoints, transport, simulator"
+            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, \
+            distill, teacher, vae, replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }

@@ -28,6 +28,7 @@ pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
 use crate::disturbances::{CommandDelay, DisturbanceSettings, DrawnDisturbances, Gust};
+use crate::oracle::Oracle;
 use crate::vehicle::{Vehicle, VehicleState};
 use crate::world::{Contact, World};
 
@@ -229,6 +230,13 @@ impl Simulator {
                 .as_ref()
                 .map_or([0.0; 3], |gust| gust.force_n().into()),
         }
+    }
+
+    /// Returns the action of the scripted expert for the current moment, each in [-1, 1]. It knows
+    /// the next opening and the drone's motion, as a drone that sees could.
+    #[must_use]
+    pub fn oracle_action(&self) -> [f32; 2] {
+        Oracle::act(&self.course, &self.state())
     }
 
     /// Returns the drone's level: 1 before the first wall, one more behind each wall.
