@@ -143,6 +143,27 @@ pub struct BestSnapshot {
     pub episodes: u64,
     /// Mean number of walls passed in the training episodes of the window at that time.
     pub window_walls_passed: f64,
+    /// Its confirmation episodes, in order.
+    pub confirmed: Vec<EpisodeWalls>,
+}
+
+/// Walls of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EpisodeWalls {
+    /// Walls passed.
+    pub passed: u8,
+    /// Walls of the course.
+    pub of: u8,
+}
+
+impl BestSnapshot {
     /// Mean number of walls passed in its confirmation episodes.
-    pub confirmed_walls_passed: f64,
+    pub fn confirmed_walls_passed(&self) -> f64 {
+        let passed: u64 = self
+            .confirmed
+            .iter()
+            .map(|walls| u64::from(walls.passed))
+            .sum();
+        passed as f64 / self.confirmed.len() as f64
+    }
 }

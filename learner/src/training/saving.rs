@@ -425,7 +425,7 @@ fn summary(
         policy_sha256: progress.policy_sha256.clone(),
         final_version: progress.version(),
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
-        best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
+        best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed()),
         trained: progress.trained,
         untrained: untrained(
             &config.learning,
