@@ -12,7 +12,6 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::IMAGE_PIXELS;
 use skein_simulator::course::Course;
-use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
@@ -65,7 +64,7 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
         .reset(1, &mut rng.clone(), &mut rng)
         .expect("every course has a first level");
     for steps in 1.. {
-        let action = Oracle::act(simulator.course(), &simulator.state());
+        let action = simulator.oracle_action();
         let report = simulator
             .step(action)
             .expect("the oracle's commands are finite");

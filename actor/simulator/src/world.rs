@@ -116,9 +116,10 @@ impl World {
         }
     }
 
-    /// Returns the position of the body's centre along the corridor, m.
-    pub(crate) fn position_x_m(&self) -> f32 {
-        self.physics.bodies[self.body].translation().x
+    /// Returns the position of the body's rearmost point along the corridor, m.
+    pub(crate) fn tail_x_m(&self) -> f32 {
+        let world_from_body = self.physics.bodies[self.body].position();
+        self.body_shape.compute_aabb(world_from_body).mins.x
     }
 
     /// Returns `true` if rapier found a pose or velocity that is not finite in the last step and
@@ -332,6 +333,21 @@ mod tests {
             world_at(Point3::new(59.501, 2.7, 3.5)).contact(),
             Contact::Obstacle
         );
+    }
+
+    #[test]
+    fn the_tail_is_the_turned_bodys_rearmost_point() {
+        let mut world = world_at(Point3::new(5.0, 0.0, 3.5));
+        assert!((world.tail_x_m() - 4.5).abs() < 1e-6);
+        push(
+            &mut world,
+            Vector3::z() * 2.0 * 9.81,
+            Vector3::y() * 0.1,
+            0.32,
+        );
+        let (_, pitch_rad, _) = world.state().world_from_body.euler_angles();
+        let half_m = 0.5 * pitch_rad.cos() + 0.1 * pitch_rad.sin();
+        assert!(pitch_rad > 0.2 && (world.tail_x_m() - (5.0 - half_m)).abs() < 1e-4);
     }
 
     #[test]
