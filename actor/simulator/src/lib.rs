@@ -17,6 +17,7 @@
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
 
+mod body;
 pub mod camera;
 pub mod course;
 pub mod disturbances;

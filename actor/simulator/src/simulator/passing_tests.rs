@@ -59,7 +59,7 @@ fn fly(simulator: &mut Simulator, episode: u64, tally: &mut Tally) {
     let level = rng.random_range(1..=simulator.course().levels());
     simulator.reset(level, &mut start, &mut air).unwrap();
     // Every fifth episode flies at random; the others err by up to 1 m/s.
-    let skill = if episode % 5 == 0 { 0.0 } else { 1.0 };
+    let skill = if episode.is_multiple_of(5) { 0.0 } else { 1.0 };
     let error_mps = rng.random_range(0.0..=1.0_f32).max(1.0 - skill);
     let report = loop {
         let action = simulator
