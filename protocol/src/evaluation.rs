@@ -161,7 +161,7 @@ mod tests {
         let episodes = [
             score(3, Outcome::ReachedEnd, None),
             score(1, Outcome::Collided, Some(2)),
-            // The drone's centre had passed the wall when its tail hit it.
+            // As older versions counted: the tail hit a wall that the centre had passed.
             score(2, Outcome::Collided, Some(2)),
             score(2, Outcome::Collided, None),
             score(0, Outcome::TimedOut, None),

@@ -13,7 +13,6 @@ use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{
     EpisodeOutcome, Obstacle, Simulator, SimulatorSettings, StepReport,
 };
@@ -71,7 +70,7 @@ fn fly(mut simulator: Simulator, seed: u64) -> Result<StepReport, Box<dyn Error>
     let [mut start, mut disturbances] = [seed, !seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances)?;
     loop {
-        let action = Oracle::act(simulator.course(), &simulator.state());
+        let action = simulator.oracle_action();
         let report = simulator.step(action)?;
         if report.outcome.is_some() {
             return Ok(report);

@@ -16,12 +16,12 @@
 //! | [`camera`] | depth image, with or without a stereo camera's errors |
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
-//! | [`oracle`] | a scripted expert that knows the course |
 
+mod body;
 pub mod camera;
 pub mod course;
 pub mod disturbances;
-pub mod oracle;
+mod oracle;
 pub mod reward;
 pub mod simulator;
 mod step_report;

@@ -2,7 +2,6 @@
 //! given drone can fly a course.
 
 use crate::course::{Course, Wall};
-use crate::simulator::walls_ahead;
 use crate::vehicle::VehicleState;
 
 /// Commanded velocity per metre of distance to the safe point, 1/s.
@@ -12,28 +11,23 @@ const APPROACH_PER_SEC: f32 = 0.8;
 /// overshoot.
 const DAMPING: f32 = 0.5;
 
-/// Flies to the next opening's safe point, then, behind the last wall, to the middle of the
+/// Returns the action `[v_y, v_z]` for a drone that has left `walls_behind` walls, m/s in the
+/// heading frame, each in [-1, 1].
+///
+/// It flies to the next opening's safe point, then, behind the last wall, to the middle of the
 /// corridor, where a gust has the longest way to blow it into anything.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Oracle;
-
-impl Oracle {
-    /// Returns the action `[v_y, v_z]` for the state, m/s in the heading frame, each in [-1, 1].
-    #[must_use]
-    pub fn act(course: &Course, state: &VehicleState) -> [f32; 2] {
-        let middle = [0.0, course.corridor().height_m / 2.0];
-        let [y_m, z_m] = walls_ahead(course, state)
-            .next()
-            .map_or(middle, Wall::safe_point);
-        let steer = |error_m: f32, velocity_mps: f32| {
-            (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0)
-        };
-        let velocity = state.heading_velocity_mps();
-        [
-            steer(y_m - state.position_m.y, velocity.y),
-            steer(z_m - state.position_m.z, velocity.z),
-        ]
-    }
+pub(crate) fn action(course: &Course, walls_behind: usize, state: &VehicleState) -> [f32; 2] {
+    let middle = [0.0, course.corridor().height_m / 2.0];
+    let next = course.walls().get(walls_behind);
+    let [y_m, z_m] = next.map_or(middle, Wall::safe_point);
+    let steer = |error_m: f32, velocity_mps: f32| {
+        (APPROACH_PER_SEC * error_m - DAMPING * velocity_mps).clamp(-1.0, 1.0)
+    };
+    let velocity = state.heading_velocity_mps();
+    [
+        steer(y_m - state.position_m.y, velocity.y),
+        steer(z_m - state.position_m.z, velocity.z),
+    ]
 }
 
 #[cfg(test)]
@@ -97,7 +91,7 @@ mod tests {
 
     fn fly(simulator: &mut Simulator) -> EpisodeOutcome {
         loop {
-            let action = Oracle::act(simulator.course(), &simulator.state());
+            let action = simulator.oracle_action();
             if let Some(outcome) = simulator.step(action).unwrap().outcome {
                 return outcome;
             }
@@ -109,24 +103,11 @@ mod tests {
         let course = test_course();
         let [y_m, z_m] = course.walls()[0].safe_point();
         let below_right = VehicleState::at_rest(Point3::new(5.0, y_m - 2.0, z_m - 2.0));
-        assert_eq!(Oracle::act(&course, &below_right), [1.0, 1.0]);
+        assert_eq!(action(&course, 0, &below_right), [1.0, 1.0]);
         let arriving = VehicleState {
             velocity_mps: Vector3::new(1.0, 1.0, 0.0),
             ..VehicleState::at_rest(Point3::new(5.0, y_m - 0.1, z_m))
         };
-        assert!(Oracle::act(&course, &arriving)[0] < 0.0);
-    }
-
-    #[test]
-    fn oracle_holds_still_until_its_tail_has_left_the_wall() {
-        let course = test_course();
-        let wall = &course.walls()[0];
-        let [y_m, z_m] = wall.safe_point();
-        let inside = VehicleState::at_rest(Point3::new(
-            wall.x_m() + course.wall_thickness_m() + 0.5,
-            y_m,
-            z_m,
-        ));
-        assert_eq!(Oracle::act(&course, &inside), [0.0, 0.0]);
+        assert!(action(&course, 0, &arriving)[0] < 0.0);
     }
 }

@@ -74,7 +74,8 @@ pub(super) fn wall_count(count: usize) -> Result<(), CourseFault> {
 fn wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
     let label = candidate.label;
     let least_m = course.start.offset_m + BODY_CLEARANCE_M;
-    let most_m = course.corridor.length_m - course.wall_thickness_m - DRONE_WIDTH_M;
+    // A tilted drone must leave the last wall before it touches the end.
+    let most_m = course.corridor.length_m - course.wall_thickness_m - 2.0 * BODY_CLEARANCE_M;
     // Written so that a NaN is refused as well.
     if !(least_m..=most_m).contains(&candidate.x_m) {
         return Err(CourseFault::OutsideCorridor {

@@ -259,6 +259,15 @@ impl Course {
         &self.walls
     }
 
+    /// Returns the number of walls whose back face lies before `x_m`. With `x_m` of the drone's
+    /// tail, these are the walls that it has left.
+    pub(crate) fn walls_before(&self, x_m: f32) -> usize {
+        self.walls
+            .iter()
+            .take_while(|wall| wall.x_m + self.wall_thickness_m < x_m)
+            .count()
+    }
+
     /// Returns the number of start levels: one before each wall.
     #[must_use]
     pub fn levels(&self) -> u8 {

@@ -3,15 +3,11 @@
 use crate::course::{Course, Wall};
 use crate::vehicle::VehicleState;
 
-/// Distance from the drone's centre to its tail plus a margin, m. A wall is behind the drone once
-/// the tail has left the opening.
-const TAIL_M: f32 = 0.6;
-
 /// Facts about a moment that the camera does not show: for the critic in training, never for the
 /// policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// Openings of the next two walls that the drone has not left entirely.
+    /// Openings of the next two walls that the drone's tail has not left.
     pub ahead: [OpeningAhead; 2],
     /// Position left and up from the middle of the corridor, m.
     pub from_middle_m: [f32; 2],
@@ -69,9 +65,14 @@ impl GroundTruth {
 }
 
 impl OpeningAhead {
-    /// Returns the next two openings, seen from the drone.
-    pub(super) fn next_two(course: &Course, state: &VehicleState) -> [Self; 2] {
-        let mut walls = walls_ahead(course, state).map(|wall| Self::of_wall(wall, state));
+    /// Returns the next two openings behind `walls_behind` walls, seen from the drone.
+    pub(super) fn next_two(
+        course: &Course,
+        walls_behind: usize,
+        state: &VehicleState,
+    ) -> [Self; 2] {
+        let walls = &course.walls()[walls_behind..];
+        let mut walls = walls.iter().map(|wall| Self::of_wall(wall, state));
         let mut next = || walls.next().unwrap_or_else(|| Self::of_end(course, state));
         [next(), next()]
     }
@@ -97,18 +98,6 @@ impl OpeningAhead {
     }
 }
 
-/// Returns the walls that the drone has not left entirely, the next one first.
-pub(crate) fn walls_ahead<'a>(
-    course: &'a Course,
-    state: &VehicleState,
-) -> impl Iterator<Item = &'a Wall> {
-    let tail_m = state.position_m.x - TAIL_M;
-    course
-        .walls()
-        .iter()
-        .filter(move |wall| wall.x_m() + course.wall_thickness_m() > tail_m)
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Point3;
@@ -122,7 +111,7 @@ mod tests {
         let walls = course.walls();
         let [y_m, z_m] = walls[0].safe_point();
         let before = VehicleState::at_rest(Point3::new(walls[0].x_m() - 4.0, y_m - 1.0, z_m + 0.5));
-        let [next, after] = OpeningAhead::next_two(&course, &before);
+        let [next, after] = OpeningAhead::next_two(&course, 0, &before);
         assert_eq!(
             (next.distance_m, next.clearance_m),
             (4.0, walls[0].clearance_m())
@@ -133,27 +122,14 @@ mod tests {
         assert!((behind_first - expected).abs() < 1e-5);
 
         let last = walls.last().unwrap();
-        let behind_all = last.x_m() + course.wall_thickness_m() + TAIL_M;
+        let behind_all = last.x_m() + course.wall_thickness_m() + 0.5;
         let behind = VehicleState::at_rest(Point3::new(behind_all, 1.0, 2.0));
-        let [next, after] = OpeningAhead::next_two(&course, &behind);
+        let [next, after] = OpeningAhead::next_two(&course, walls.len(), &behind);
         assert_eq!(next, after);
         assert_eq!(next.distance_m, course.corridor().length_m - behind_all);
         assert_eq!(
             next.offset_m,
             [-1.0, course.corridor().height_m / 2.0 - 2.0]
         );
-    }
-
-    #[test]
-    fn a_wall_is_ahead_until_the_tail_has_left_it() {
-        let course = test_course();
-        let wall = &course.walls()[0];
-        let tail_leaves = wall.x_m() + course.wall_thickness_m() + TAIL_M;
-        let first = |x_m| {
-            let state = VehicleState::at_rest(Point3::new(x_m, 0.0, 1.0));
-            walls_ahead(&course, &state).next().map(Wall::label)
-        };
-        assert_eq!(first(tail_leaves - 0.01), Some(wall.label()));
-        assert_ne!(first(tail_leaves + 0.01), Some(wall.label()));
     }
 }
