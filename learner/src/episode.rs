@@ -36,6 +36,7 @@ const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     1.0,                // mass
     1.0,                // latency
     3.0, 3.0, 3.0,      // gust
+    0.25, 0.25,         // half the corridor's width and height
 ];
 
 /// A whole episode of T steps, or T consecutive steps of one.
@@ -371,10 +372,11 @@ mod tests {
         let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
         assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
-        assert_eq!(state[16..19], seen.velocity_mps);
-        assert_eq!(state[21..], episode.actions[3]);
+        assert_eq!(state[GROUND_TRUTH..GROUND_TRUTH + 3], seen.velocity_mps);
+        let before = CRITIC_STATE - ACTION;
+        assert_eq!(state[before..], episode.actions[3]);
         episode.write_critic_state(0, &mut state);
-        assert_eq!(state[21..], [0.0, 0.0]);
+        assert_eq!(state[before..], [0.0, 0.0]);
     }
 
     #[test]

@@ -42,7 +42,7 @@ pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
 /// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
-pub const GROUND_TRUTH: usize = 16;
+pub const GROUND_TRUTH: usize = 18;
 /// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
 /// `[2]` and previous action.
 pub const CRITIC_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;

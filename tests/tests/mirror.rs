@@ -167,6 +167,7 @@ fn mirroring_swaps_left_and_right_and_nothing_else() {
             mass_factor: 1.1,
             latency_periods: 1.0,
             gust_n: [0.1, side * 0.2, 0.3],
+            half_section_m: [3.0, 3.5],
         }
     };
     let mut flown = fly(1.0);

@@ -39,10 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// Flies an entry and returns its row of the table.
 fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
-    let settings = SimulatorSettings {
-        disturbances: entry.disturbances.clone(),
-        ..Default::default()
-    };
+    let settings = entry.settings(&SimulatorSettings::default());
     let (mut arrived, mut passed, mut walls) = (0, 0, 0);
     let (mut hit_wall, mut hit_corridor, mut timed_out) = (0, 0, 0);
     for episode in 0..episodes {

@@ -47,11 +47,11 @@ pub(crate) fn message_of(error: &toml::de::Error) -> String {
 }
 
 /// Deserializes exactly `N` numbers. The parser alone ignores further ones.
-pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(
+pub(crate) fn exactly<'de, D: Deserializer<'de>, T: Deserialize<'de>, const N: usize>(
     deserializer: D,
-) -> Result<[f32; N], D::Error> {
-    let numbers = Vec::<f32>::deserialize(deserializer)?;
-    numbers.try_into().map_err(|numbers: Vec<f32>| {
+) -> Result<[T; N], D::Error> {
+    let numbers = Vec::<T>::deserialize(deserializer)?;
+    numbers.try_into().map_err(|numbers: Vec<T>| {
         D::Error::custom(format!(
             "has {} numbers: give {N} (a decimal point is a dot)",
             numbers.len()

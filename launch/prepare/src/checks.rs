@@ -53,18 +53,19 @@ pub fn check(
     check_level_count(
         config_file,
         config,
-        &Course::load(&config.courses.training)?,
+        Course::load(&config.courses.training)?.walls().len(),
         &config.courses.training.display(),
     )?;
     let trains_on_generated = config.courses.generated_share > 0.0;
     if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
-        let course =
-            Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
-                config: in_file(),
-                source,
-            })?;
+        let ranges = &settings.generator;
+        ranges.check().map_err(|source| PrepareError::Ranges {
+            config: in_file(),
+            source,
+        })?;
+        let (corridor, start) = ranges.longest();
         settings
-            .check_reach(course.corridor(), course.start())
+            .check_reach(corridor, start)
             .map_err(|source| PrepareError::OutOfReach {
                 config: in_file(),
                 course: "[simulator.generator]".to_owned(),
@@ -74,8 +75,11 @@ pub fn check(
             check_level_count(
                 config_file,
                 config,
-                &course,
-                &"[simulator.generator] wall_x_m",
+                ranges.most_walls(),
+                &match ranges.layout {
+                    Some(_) => "[simulator.generator] layout.walls",
+                    None => "[simulator.generator] wall_x_m",
+                },
             )?;
         }
     }
@@ -113,15 +117,16 @@ fn check_warmup(config_file: &Path, config: &Config, max_steps: u32) -> Result<(
     })
 }
 
-/// Checks that `course`, called `name` in messages, has all start levels of the training.
+/// Checks that a course with `walls` walls, called `name` in messages, has all start levels of the
+/// training.
 fn check_level_count(
     config_file: &Path,
     config: &Config,
-    course: &Course,
+    walls: usize,
     name: &dyn std::fmt::Display,
 ) -> Result<(), PrepareError> {
-    let (levels, walls) = (config.learning.levels, course.levels());
-    if levels <= walls {
+    let levels = config.learning.levels;
+    if usize::from(levels) <= walls {
         return Ok(());
     }
     Err(PrepareError::TooManyLevels {

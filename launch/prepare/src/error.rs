@@ -104,8 +104,8 @@ pub enum PrepareError {
         levels: u8,
         /// Name of the course, or of the ranges of generated courses.
         course: String,
-        /// Number of its walls.
-        walls: u8,
+        /// Number of its walls, or the most that the ranges allow.
+        walls: usize,
     },
     /// The transport allows fewer actors.
     #[error("{actors} actors are more than transport.max_actors = {max}: start fewer, or raise it")]

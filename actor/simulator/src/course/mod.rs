@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 pub use fault::{CourseFault, FaultLocation, NoSuchLevel};
 pub use file::CourseError;
-pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
+pub use generator::{GeneratedShape, GeneratorRanges, LayoutRanges, RangesError};
 pub(crate) use mesh::{Mesh, MeshSurface, SurfaceKind};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
 

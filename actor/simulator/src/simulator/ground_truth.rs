@@ -19,6 +19,8 @@ pub struct GroundTruth {
     pub latency_periods: f32,
     /// The gust's force in the world frame: forward, left, up, N.
     pub gust_n: [f32; 3],
+    /// Half the corridor's width and height, m.
+    pub half_section_m: [f32; 2],
 }
 
 /// An opening relative to the drone. Behind the last wall, the end wall stands for an opening as
@@ -35,7 +37,7 @@ pub struct OpeningAhead {
 
 impl GroundTruth {
     /// Length of [`Self::numbers`].
-    pub const NUMBERS: usize = 16;
+    pub const NUMBERS: usize = 18;
 
     /// Returns all fields as numbers, in their order.
     #[must_use]
@@ -45,6 +47,7 @@ impl GroundTruth {
             [ahead.distance_m, left, up, ahead.clearance_m]
         });
         let [left, up] = self.from_middle_m;
+        let [half_width, half_height] = self.half_section_m;
         let [gust_x, gust_y, gust_z] = self.gust_n;
         let rest = [
             left,
@@ -55,6 +58,8 @@ impl GroundTruth {
             gust_x,
             gust_y,
             gust_z,
+            half_width,
+            half_height,
         ];
         let mut numbers = [0.0; Self::NUMBERS];
         numbers[..4].copy_from_slice(&next);

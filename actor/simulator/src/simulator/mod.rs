@@ -237,6 +237,7 @@ impl Simulator {
                 .gust
                 .as_ref()
                 .map_or([0.0; 3], |gust| gust.force_n().into()),
+            half_section_m: [corridor.width_m / 2.0, corridor.height_m / 2.0],
         }
     }
 

@@ -72,6 +72,9 @@ pub enum SuiteEntryError {
     /// Neither the entry nor the suite has a number of episodes.
     #[error("has no episodes, and neither has the suite: add episodes to one of them")]
     NoEpisodes,
+    /// `max_steps = 0`.
+    #[error("max_steps = 0: an episode needs at least one step")]
+    NoSteps,
     /// A course file cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
@@ -123,6 +126,8 @@ struct EntryTable {
     orders_of: Option<PathBuf>,
     generated: Option<GeneratorRanges>,
     first_seed: Option<u64>,
+    /// Step limit of the entry's episodes, if not the policy's own.
+    max_steps: Option<u32>,
     #[serde(default)]
     disturbances: DisturbanceSettings,
 }
@@ -194,10 +199,14 @@ impl Suite {
         if !(1..=MOST_EPISODES).contains(&episodes) {
             return Err(SuiteEntryError::Episodes(episodes));
         }
+        if table.max_steps == Some(0) {
+            return Err(SuiteEntryError::NoSteps);
+        }
         Ok(SuiteEntry {
             episodes,
             courses: courses(&table, folder)?,
             disturbances: table.disturbances,
+            max_steps: table.max_steps,
             name: table.name,
         })
     }
@@ -214,7 +223,7 @@ fn courses(table: &EntryTable, folder: &Path) -> Result<EntryCourses, SuiteEntry
         (None, Some(file), None) => all_orders(&folder.join(file)).map(EntryCourses::Listed),
         (None, None, Some(ranges)) => {
             let first_seed = table.first_seed.unwrap_or(0);
-            // The first course shows any fault of the ranges.
+            ranges.check()?;
             Course::generate(first_seed, ranges)?;
             Ok(EntryCourses::Generated {
                 first_seed,

@@ -82,7 +82,7 @@ impl FlownSuite {
                 .disturbances
                 .validate(&settings.vehicle, settings.camera.range_m);
             flown.map_err(|fault| format!("entry \"{}\": {}", entry.name, with_causes(&fault)))?;
-            let reached = entry.courses.check_reach(&settings);
+            let reached = entry.courses.check_reach(&entry.settings(&settings));
             reached.map_err(|fault| format!("entry \"{}\": {fault}", entry.name))?;
         }
         Ok(())
