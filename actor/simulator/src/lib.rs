@@ -17,6 +17,7 @@
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
 //! | [`oracle`] | a scripted expert that knows the course |
+//! | [`text`] | rules for names and lists in files |
 
 pub mod camera;
 pub mod course;
@@ -26,6 +27,6 @@ pub mod reward;
 pub mod simulator;
 mod step_report;
 pub mod suite;
-mod text;
+pub mod text;
 pub mod vehicle;
 mod world;
