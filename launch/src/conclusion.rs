@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use skein_protocol::config::EvaluationSection;
 use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::files::{self, REPORT_BYTES};
 use skein_protocol::stages::StageTimes;
 use skein_protocol::summary::{RunEnding, RunSummary, Trained};
 use skein_run::RunDirectory;
@@ -60,7 +61,7 @@ fn push(text: &mut String, line: &str) {
 }
 
 fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
-    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    serde_json::from_slice(&files::read(path, REPORT_BYTES).ok()?).ok()
 }
 
 fn trained_sentence(trained: &Trained) -> String {

@@ -96,7 +96,7 @@ pub fn resume(
             .canonicalize()
             .map_err(|_| not_a_run(Path::new("run.json")))?,
     );
-    if !run.identity().is_file() {
+    if !run.identity().exists() {
         return Err(not_a_run(Path::new("run.json")));
     }
     let (identity, config) = match episodes {

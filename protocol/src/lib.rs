@@ -3,11 +3,13 @@
 //! The crate defines the work of an actor ([`ticket`], [`segment`]), one flown step on the wire
 //! ([`transition`]), a policy snapshot ([`snapshot`]), an actor's reports ([`status`], [`stages`]),
 //! the configuration of a run ([`config`]), and the formats of its files ([`evaluation`],
-//! [`summary`]) and progress reports ([`progress`]). It only defines them: the crate
-//! `skein-transport` carries the records; `skein-run` manages files and processes.
+//! [`summary`]) and progress reports ([`progress`]), and how such files are read ([`files`]). It
+//! only defines them: the crate `skein-transport` carries the records; `skein-run` manages files
+//! and processes.
 
 pub mod config;
 pub mod evaluation;
+pub mod files;
 pub mod ids;
 pub mod progress;
 pub mod seeds;

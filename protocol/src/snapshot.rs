@@ -6,7 +6,7 @@
 //! configuration in the metadata, so that the file alone can be flown.
 
 use std::collections::HashMap;
-use std::fs;
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -17,6 +17,7 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::ACTION;
 use crate::config::{AlgorithmName, Config, ObservationLayout};
+use crate::files::{self, TENSOR_BYTES};
 use crate::ids::{PolicyVersion, RunId};
 
 /// Channels of the encoder's four 4×4 convolutions of stride 2; the first entry is the image's
@@ -230,14 +231,27 @@ pub enum SnapshotError {
         /// The tensor.
         tensor: String,
     },
-    /// The file cannot be read or written.
+    /// The file cannot be read.
+    #[error(
+        "cannot read the snapshot {}: {source}{}",
+        path.display(),
+        remedy(source)
+    )]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Cause.
+        #[source]
+        source: io::Error,
+    },
+    /// The file cannot be written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
         /// Cause.
         #[source]
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The file is not a snapshot of this version.
     #[error("{} is not a snapshot of this version: {problem}", path.display())]
@@ -350,7 +364,7 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError`] names the file and the problem.
     pub fn load(path: &Path) -> Result<(Self, Config), SnapshotError> {
-        let bytes = fs::read(path).map_err(|source| SnapshotError::Io {
+        let bytes = files::read(path, TENSOR_BYTES).map_err(|source| SnapshotError::Read {
             path: path.to_owned(),
             source,
         })?;
@@ -366,6 +380,16 @@ impl Snapshot {
             path: path.to_owned(),
             problem,
         })
+    }
+}
+
+/// Returns the remedy, if there is one.
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::NotFound => {
+            "; name a file such as DIR/snapshots/best.safetensors, or a run with --run DIR"
+        }
+        _ => "",
     }
 }
 
@@ -455,6 +479,8 @@ fn values_of(bytes: &[u8]) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::config::Observation;
 

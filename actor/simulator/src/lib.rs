@@ -16,6 +16,7 @@
 //! | [`camera`] | depth image, with or without a stereo camera's errors |
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
+//! | [`text`] | rules for names and lists in files |
 
 mod body;
 pub mod camera;
@@ -26,6 +27,6 @@ pub mod reward;
 pub mod simulator;
 mod step_report;
 pub mod suite;
-mod text;
+pub mod text;
 pub mod vehicle;
 mod world;

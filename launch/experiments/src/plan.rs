@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
+use skein_protocol::files::{self, SETTINGS_BYTES};
 use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
@@ -272,7 +273,8 @@ fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, Str
     let mut courses = Vec::new();
     for (here, there) in expected.courses.paths_mut().zip(stored.courses.paths_mut()) {
         // The copy has another name if two course files had the same name.
-        match fs::read(&here).ok() == fs::read(&there).ok() {
+        let content = |path: &Path| files::read(path, SETTINGS_BYTES).ok();
+        match content(here) == content(there) {
             true => here.clone_from(there),
             false => courses.push(format!("the course {} has changed since", here.display())),
         }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use skein_protocol::config::{Config, ConfirmOn, failing_override};
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::text::first_repeated;
 
 use super::PrepareError;
 
@@ -58,6 +59,12 @@ pub fn check(
     )?;
     let trains_on_generated = config.courses.generated_share > 0.0;
     if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
+        if let Some(shape) = first_repeated(&settings.generator.shapes) {
+            return Err(PrepareError::RepeatedShape {
+                config: in_file(),
+                shape: shape.name(),
+            });
+        }
         let ranges = &settings.generator;
         ranges.check().map_err(|source| PrepareError::Ranges {
             config: in_file(),

@@ -32,9 +32,9 @@ impl NewDirectory {
     /// Creates `directory` unless it exists and is empty. Only its owner can access it afterwards.
     ///
     /// # Errors
-    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with the path.
+    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::RunDirectory`] with the path.
     pub(super) fn make(directory: &Path) -> Result<Self, PrepareError> {
-        let io = |source| PrepareError::Io {
+        let io = |source| PrepareError::RunDirectory {
             path: directory.to_owned(),
             source,
         };

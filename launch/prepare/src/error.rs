@@ -46,6 +46,17 @@ pub enum PrepareError {
         #[source]
         source: RangesError,
     },
+    /// A shape of generated courses is listed twice.
+    #[error(
+        "{}: [simulator.generator] shapes lists {shape:?} twice: name each shape once",
+        config.display()
+    )]
+    RepeatedShape {
+        /// The configuration file.
+        config: PathBuf,
+        /// Name of the shape.
+        shape: &'static str,
+    },
     /// No episode can finish a course.
     #[error("{}: {course}: {source}", config.display())]
     OutOfReach {
@@ -129,6 +140,15 @@ pub enum PrepareError {
         quoted(.0)
     )]
     NotEmpty(PathBuf),
+    /// The run's directory cannot be created or used, for example because it is a file.
+    #[error("{}: {source}: name a new or empty directory with --run-dir", path.display())]
+    RunDirectory {
+        /// The directory.
+        path: PathBuf,
+        /// The operating system's error.
+        #[source]
+        source: io::Error,
+    },
     /// A file or folder of the run cannot be written.
     #[error("{}: {source}", path.display())]
     Io {

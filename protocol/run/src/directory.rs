@@ -9,6 +9,7 @@ use serde::Deserialize;
 use crate::{RunIdentity, courses, durable};
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::{Config, ConfigError};
+use skein_protocol::files::{self, REPORT_BYTES, SETTINGS_BYTES};
 use skein_protocol::ids::ActorId;
 
 /// Paths within a run's directory.
@@ -242,7 +243,7 @@ impl RunDirectory {
         fit: impl Fn(&RunIdentity, &Config) -> bool,
     ) -> Result<(RunIdentity, Config), RunError> {
         let path = self.identity();
-        let text = fs::read_to_string(&path).map_err(|source| RunError::Io {
+        let text = files::read_text(&path, REPORT_BYTES).map_err(|source| RunError::Io {
             path: path.clone(),
             source,
         })?;
@@ -284,7 +285,7 @@ impl RunDirectory {
     fn started_config(&self, identity: &RunIdentity) -> Option<String> {
         let copies = self.checkpoint_names().into_iter().map(|episodes| {
             let file = format!("episode-{episodes}/config.toml");
-            fs::read_to_string(self.checkpoints().join(file))
+            files::read_text(&self.checkpoints().join(file), SETTINGS_BYTES)
         });
         copies
             .flatten()

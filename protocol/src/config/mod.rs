@@ -25,7 +25,7 @@ use crate::segment::MAX_PRIOR_ACTIONS;
 pub use courses::CoursesSection;
 pub use distill::DistillSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
-pub use file::{ConfigError, failing_override};
+pub use file::{ConfigError, failing_override, integer_too_large};
 pub use learning::{
     AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
 };

@@ -169,7 +169,14 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
 fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
     let wall = candidate.label;
     let outline = candidate.opening.outline();
-    if let Some(edges) = polygon::self_intersection(&outline) {
+    if let Some((first, second)) = polygon::self_intersection(&outline) {
+        // The outline of corners listed clockwise runs the other way round.
+        let count = outline.len();
+        let edges = match polygon::signed_area(&candidate.opening.shape.corners()) < 0.0 {
+            true => [second, first].map(|edge| (2 * count - 2 - edge) % count),
+            false => [first, second],
+        };
+        let edges = (edges[0].min(edges[1]), edges[0].max(edges[1]));
         return Err(CourseFault::SelfIntersecting { wall, edges });
     }
     let limit_y_m = course.corridor.width_m / 2.0 - FRAME_M;
@@ -193,6 +200,14 @@ fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, Cou
 /// the start area.
 fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
     let previous = course.walls.last();
+    if let Some(previous) = previous.filter(|previous| wall.x_m <= previous.x_m) {
+        return Err(CourseFault::NotBehind {
+            wall: wall.label,
+            x_m: wall.x_m,
+            previous: previous.label,
+            previous_x_m: previous.x_m,
+        });
+    }
     let start = course.start;
     let behind_m = previous.map_or(0.0, |previous| previous.x_m);
     let from_start = (
