@@ -74,7 +74,7 @@ pub(super) fn draw_head<'a>(
                 below.draw(&Circle::new(middle, px(3), colour.mix(0.4).filled()))?;
             }
         }
-        below.draw_text(entry.label, &style, (x + px(MARK) as i32, y - px(9) as i32))?;
+        below.draw_text(entry.label, &style, (x + px(MARK) as i32, y - px(5) as i32))?;
     }
     let rows = places.last().map_or(0, |(_, row)| row + 1);
     let (_, rest) = below.split_vertically(px(rows * ROW));

@@ -169,7 +169,7 @@ pub enum CourseFault {
         x_m: f32,
         /// The wall that it follows.
         previous: WallLabel,
-        /// That wall's front face, metres.
+        /// Front face of the previous wall, metres.
         previous_x_m: f32,
     },
     /// The wall is too close behind the previous one for the sidestep between the openings.
