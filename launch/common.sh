@@ -48,6 +48,13 @@ build_training() {
         --bin skein --bin skein-learner --bin skein-actor
 }
 
+# Builds what the training of an encoder needs.
+build_encoder() {
+    "$repository/launch/setup.sh"
+    cargo_build "building what trains an encoder, with libtorch (3 to 5 minutes on two cores the first time)" \
+        --bin skein --bin skein-encoder
+}
+
 # Builds every program.
 build() {
     "$repository/launch/setup.sh"

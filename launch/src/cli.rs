@@ -1,5 +1,6 @@
 //! The command line of `skein`, and with it every help text of the commands in `launch/`.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
@@ -20,7 +21,8 @@ pub(crate) struct Cli {
 
 const SCRIPTS: &str = "\
 The scripts in launch/ build what a command needs and hand over to it: run_local.sh (run), \
-attach_actor.sh (attach), evaluate.sh (evaluate), experiment.sh (experiment).";
+attach_actor.sh (attach), encoder.sh (encoder), evaluate.sh (evaluate), experiment.sh \
+(experiment).";
 
 /// The commands; the text of each stands at its arguments.
 #[derive(Subcommand)]
@@ -29,6 +31,7 @@ pub(crate) enum Command {
     Run(RunArguments),
     #[command(after_long_help = ATTACH_NOTES)]
     Attach(AttachArguments),
+    Encoder(EncoderArguments),
     Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
@@ -119,6 +122,21 @@ const ATTACH_NOTES: &str = "\
 Ctrl-C removes these actors again; the run continues without them.
 
 Exit status: 0 the run ended, 1 failed, 2 wrong arguments, 130 interrupted.";
+
+/// Trains an encoder before any run, or measures one.
+///
+/// The program skein-encoder does it, and has the options: skein encoder --help.
+#[derive(Args)]
+#[command(disable_help_flag = true)]
+pub(crate) struct EncoderArguments {
+    /// Options of skein-encoder.
+    #[arg(
+        value_name = "OPTIONS",
+        trailing_var_arg = true,
+        allow_hyphen_values = true
+    )]
+    pub(crate) options: Vec<OsString>,
+}
 
 /// Trains several configurations with several seeds, and reports how they compare.
 ///

@@ -4,9 +4,10 @@
 mod cli;
 mod experiment;
 
+use std::os::unix::process::CommandExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{self, ExitCode};
 use std::thread;
 use std::time::Duration;
 
@@ -34,7 +35,7 @@ use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 use skein_run::{note, show};
 
-use cli::{AttachArguments, Cli, Command, ReportArguments, RunArguments, Task};
+use cli::{AttachArguments, Cli, Command, EncoderArguments, ReportArguments, RunArguments, Task};
 
 /// Contexts of errors that the operating system may return.
 const RUNTIME: &str = "cannot start the runtime";
@@ -52,6 +53,7 @@ fn main() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),
+        Command::Encoder(arguments) => encoder(&arguments),
         Command::Evaluate(arguments) => skein_evaluate::run(&arguments).map(|()| ExitCode::SUCCESS),
         Command::Experiment(arguments) => {
             warn_of_environment();
@@ -285,6 +287,22 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
         let mut interrupts = interrupts().context(SIGNALS)?;
         let is_under_way = || run.is_running().unwrap_or(false);
         Ok(supervisor::attach(&plan, is_under_way, &mut interrupts, &mut display).await?)
+    })
+}
+
+/// Becomes the program that trains encoders: it needs libtorch, which this one does without.
+fn encoder(arguments: &EncoderArguments) -> anyhow::Result<ExitCode> {
+    let program = std::env::current_exe()
+        .context("cannot find where this program lies")?
+        .with_file_name("skein-encoder");
+    let error = process::Command::new(&program)
+        .args(&arguments.options)
+        .exec();
+    Err(error).with_context(|| {
+        format!(
+            "cannot start {}: build it with launch/encoder.sh",
+            program.display()
+        )
     })
 }
 

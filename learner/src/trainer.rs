@@ -10,6 +10,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{AlgorithmName, Config, Engine};
+use skein_protocol::encoder_file::{EncoderError, TrainedEncoder};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
@@ -36,6 +37,17 @@ use crate::vae::{Vae, VaeMetrics};
 /// Images encoded at once when stored latent codes are computed again.
 const ENCODE_CHUNK: usize = 64;
 
+/// Reason why a trainer cannot be created.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainerError {
+    /// The configured device does not exist.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// The configured encoder cannot be used.
+    #[error(transparent)]
+    Encoder(#[from] EncoderError),
+}
+
 /// Reason why a stored state cannot be restored.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainerRestoreError {
@@ -57,6 +69,37 @@ pub enum TrainerRestoreError {
     },
 }
 
+/// Source of the encoder's parameters.
+#[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one of them in a process"
+)]
+enum EncoderSource {
+    /// A VAE, trained along and then frozen.
+    Vae(Vae),
+    /// A file; frozen from the first episode on.
+    File(TrainedEncoder),
+    /// The algorithm, which trains the encoder itself.
+    Algorithm,
+}
+
+impl EncoderSource {
+    fn vae(&self) -> Option<&Vae> {
+        match self {
+            Self::Vae(vae) => Some(vae),
+            Self::File(_) | Self::Algorithm => None,
+        }
+    }
+
+    fn vae_mut(&mut self) -> Option<&mut Vae> {
+        match self {
+            Self::Vae(vae) => Some(vae),
+            Self::File(_) | Self::Algorithm => None,
+        }
+    }
+}
+
 /// Networks and replay buffer.
 #[derive(Debug)]
 pub(crate) struct Trainer {
@@ -64,8 +107,7 @@ pub(crate) struct Trainer {
     layout: SnapshotLayout,
     /// Threads of the native engine.
     team: Team,
-    /// The VAE; `None` where the algorithm trains the encoder.
-    vae: Option<Vae>,
+    source: EncoderSource,
     /// The actors' encoder, and the number of VAE updates it was made after.
     encoder: Option<(u64, Encoder)>,
     algorithm: Box<dyn Algorithm>,
@@ -101,16 +143,22 @@ impl Trainer {
     /// the number of tensor threads of the calling thread, so training must stay on this thread.
     ///
     /// # Errors
-    /// [`DeviceError`] when the configured device does not exist.
-    pub(crate) fn new(config: &Config) -> Result<Self, DeviceError> {
+    /// [`TrainerError`] when the configured device does not exist, or the configured encoder cannot
+    /// be used.
+    pub(crate) fn new(config: &Config) -> Result<Self, TrainerError> {
         device::use_threads(config.run.learner_threads);
         let device = device::open(config.run.device)?;
         let engine = config.policy_engine();
-        let vae = (!config.learning.end_to_end()).then(|| config.vae.engine(&config.run));
+        let source = match TrainedEncoder::of(config)? {
+            Some(encoder) => EncoderSource::File(encoder),
+            None if config.learning.end_to_end() => EncoderSource::Algorithm,
+            None => EncoderSource::Vae(Vae::new(&config.vae, &config.run, device)),
+        };
+        let vae_engine = source.vae().map(|_| config.vae.engine(&config.run));
         let (isa, threads) = (Isa::best(), config.run.learner_threads);
         tracing::info!(
             %engine,
-            vae_engine = vae.map(tracing::field::display),
+            vae_engine = vae_engine.map(tracing::field::display),
             device = %config.run.device,
             %isa,
             threads,
@@ -125,7 +173,7 @@ impl Trainer {
                 Engine::Native => threads,
                 Engine::Libtorch => 1,
             }),
-            vae: vae.map(|_| Vae::new(&config.vae, &config.run, device)),
+            source,
             encoder: None,
             algorithm,
             replay: Replay::new(config),
@@ -145,7 +193,7 @@ impl Trainer {
         tensors: &[NamedTensor],
         replay: ReplayState,
     ) -> Result<(), TrainerRestoreError> {
-        if let Some(vae) = &mut self.vae {
+        if let Some(vae) = self.source.vae_mut() {
             vae.load_named(tensors)?;
         }
         self.encoder = None;
@@ -188,7 +236,7 @@ impl Trainer {
 
     /// VAE steps done so far.
     pub(crate) fn vae_updates(&self) -> u64 {
-        self.vae.as_ref().map_or(0, Vae::updates)
+        self.source.vae().map_or(0, Vae::updates)
     }
 
     /// The replay buffer.
@@ -235,8 +283,10 @@ impl Trainer {
         let learning = &self.config.learning;
         let mirrored = learning.mirror.then(|| episode.mirrored());
         // With policy lag, some episodes arrive after the freeze that were flown with an older
-        // encoder: encode them again. Without lag, images come only for the mirror.
-        if !self.has_images() && (learning.policy_lag > 0 || !learning.mirror) {
+        // encoder: encode them again. Without lag, images come only for the mirror, and likewise
+        // with an encoder that never changes.
+        let may_be_older = learning.policy_lag > 0 && self.source.vae().is_some();
+        if !self.has_images() && (may_be_older || !learning.mirror) {
             self.encode(&mut episode);
         }
         self.steps += episode.steps() as u64;
@@ -255,10 +305,12 @@ impl Trainer {
         self.replay.insert(episode)
     }
 
-    /// Encodes an episode's images with the present encoder. Does nothing without images or without
-    /// a VAE.
+    /// Encodes an episode's images with the present encoder. Does nothing without images, or where
+    /// the algorithm trains the encoder.
     fn encode(&mut self, episode: &mut CommittedEpisode) {
-        let (Some(depth), Some(_)) = (&episode.depth, &self.vae) else {
+        let (Some(depth), EncoderSource::Vae(_) | EncoderSource::File(_)) =
+            (&episode.depth, &self.source)
+        else {
             return;
         };
         let (encoder, team, _) = self.encoder();
@@ -280,11 +332,8 @@ impl Trainer {
         timer: &mut LapTimer,
         mut after_each: impl FnMut(&VaeMetrics) -> Result<(), E>,
     ) -> Result<Option<VaeMetrics>, E> {
-        let Some(vae) = self
-            .vae
-            .as_mut()
-            .filter(|_| self.replay.image_count().is_some())
-        else {
+        let has_images = self.has_images();
+        let Some(vae) = self.source.vae_mut().filter(|_| has_images) else {
             return Ok(None);
         };
         let section = &self.config.vae;
@@ -391,9 +440,10 @@ impl Trainer {
     pub(crate) fn snapshot(&self, version: PolicyVersion) -> Snapshot {
         let mut values = vec![0.0; self.layout.values()];
         let encoder = &mut values[self.layout.encoder()];
-        match &self.vae {
-            Some(vae) => vae.publish(encoder),
-            None => self.algorithm.publish_encoder(encoder),
+        match &self.source {
+            EncoderSource::Vae(vae) => vae.publish(encoder),
+            EncoderSource::File(trained) => encoder.copy_from_slice(&trained.values),
+            EncoderSource::Algorithm => self.algorithm.publish_encoder(encoder),
         }
         let policy = &mut values[self.layout.policy()];
         match &self.average {
@@ -405,7 +455,8 @@ impl Trainer {
 
     /// Returns the VAE's reconstruction of `images`, both `[n, 72, 128]` u8; `None` without a VAE.
     pub(crate) fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
-        let depth = self.vae.as_mut()?.reconstruct(images).into_iter();
+        let vae = self.source.vae_mut()?;
+        let depth = vae.reconstruct(images).into_iter();
         Some(
             depth
                 .map(|depth| (depth * 255.0).round_ties_even() as u8)
@@ -416,8 +467,8 @@ impl Trainer {
     /// Copies all tensors that updates change.
     pub(crate) fn tensors(&mut self) -> Vec<NamedTensor> {
         let mut all = self
-            .vae
-            .as_mut()
+            .source
+            .vae_mut()
             .map(Vae::named_tensors)
             .unwrap_or_default();
         all.extend(self.algorithm.named_tensors());

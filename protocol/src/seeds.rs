@@ -43,6 +43,12 @@ pub enum Purpose {
     ConfirmationCourse = 14,
     /// Steps of an episode that the teacher flies; derived from the ticket's seed.
     TeacherSteps = 15,
+    /// Courses and poses of the views that an encoder is trained on; indexed by course.
+    EncoderViews = 16,
+    /// Reparameterisation noise of a step that trains an encoder; indexed by step.
+    EncoderNoise = 17,
+    /// Courses and poses of the views on which an encoder is measured; indexed by course.
+    MeasuredViews = 18,
 }
 
 /// Returns the seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

@@ -155,6 +155,12 @@ impl SnapshotLayout {
         0..self.encoder_values
     }
 
+    /// Returns the encoder's tensors, which precede the policy's.
+    pub fn encoder_tensors(&self) -> &[TensorSpec] {
+        let is_encoders = |tensor: &TensorSpec| tensor.range.end <= self.encoder_values;
+        &self.tensors[..self.tensors.partition_point(is_encoders)]
+    }
+
     /// Returns the range of the policy's values.
     pub fn policy(&self) -> Range<usize> {
         self.encoder_values..self.values()
@@ -307,22 +313,8 @@ impl Snapshot {
             version: PolicyVersion(header.policy_version),
             values: values_of(bytes),
         };
-        snapshot.check_finite(layout)?;
+        check_finite(layout.tensors(), &snapshot.values)?;
         Ok(snapshot)
-    }
-
-    fn check_finite(&self, layout: &SnapshotLayout) -> Result<(), SnapshotError> {
-        let broken = |tensor: &&TensorSpec| {
-            self.values[tensor.range.clone()]
-                .iter()
-                .any(|value| !value.is_finite())
-        };
-        match layout.tensors().iter().find(broken) {
-            Some(tensor) => Err(SnapshotError::NotFinite {
-                tensor: tensor.name.clone(),
-            }),
-            None => Ok(()),
-        }
     }
 
     /// Returns the SHA-256 of the parameters' bytes in hexadecimal: equal exactly if two policies
@@ -338,24 +330,15 @@ impl Snapshot {
     /// # Panics
     /// If the number of values does not match `layout`.
     pub fn to_file(&self, layout: &SnapshotLayout, config: &Config) -> Vec<u8> {
-        let bytes: &[u8] = bytemuck::cast_slice(&self.values);
-        let views = layout.tensors().iter().map(|tensor| {
-            let range = tensor.range.start * size_of::<f32>()..tensor.range.end * size_of::<f32>();
-            let tensor_view = TensorView::new(Dtype::F32, tensor.shape.clone(), &bytes[range])
-                .expect("a tensor's range is as long as its shape says");
-            (tensor.name.clone(), tensor_view)
-        });
         let (version, config) = (self.version.to_string(), config.portable());
+        let digest = checksum(&[&version, &config], &self.values);
         let metadata = HashMap::from([
             (FORMAT_KEY.to_owned(), FORMAT.to_owned()),
-            (
-                CHECKSUM_KEY.to_owned(),
-                checksum(&version, &config, &self.values),
-            ),
+            (CHECKSUM_KEY.to_owned(), digest),
             (VERSION_KEY.to_owned(), version),
             (CONFIG_KEY.to_owned(), config),
         ]);
-        safetensors::serialize(views, Some(metadata)).expect("names and shapes are plain data")
+        write_tensors(layout.tensors(), &self.values, metadata)
     }
 
     /// Reads a snapshot file and the configuration it was trained with. That configuration holds
@@ -393,18 +376,18 @@ fn remedy(error: &io::Error) -> &'static str {
     }
 }
 
-const FORMAT_KEY: &str = "skein.format";
+pub(crate) const FORMAT_KEY: &str = "skein.format";
 const FORMAT: &str = "policy-snapshot-2";
 /// Metadata key of the [`checksum`].
-const CHECKSUM_KEY: &str = "skein.checksum";
+pub(crate) const CHECKSUM_KEY: &str = "skein.checksum";
 const VERSION_KEY: &str = "skein.policy_version";
-const CONFIG_KEY: &str = "skein.config";
+pub(crate) const CONFIG_KEY: &str = "skein.config";
 
-/// Returns the xxh3 of a snapshot file's content in hexadecimal. Nothing else detects a flipped bit
+/// Returns the xxh3 of a parameter file's content in hexadecimal. Nothing else detects a flipped bit
 /// that leaves finite numbers.
-fn checksum(version: &str, config: &str, values: &[f32]) -> String {
+pub(crate) fn checksum(texts: &[&str], values: &[f32]) -> String {
     let mut hasher = Xxh3::new();
-    for text in [version, config] {
+    for text in texts {
         hasher.update(&(text.len() as u64).to_le_bytes());
         hasher.update(text.as_bytes());
     }
@@ -412,61 +395,115 @@ fn checksum(version: &str, config: &str, values: &[f32]) -> String {
     format!("{:016x}", hasher.digest())
 }
 
-fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
-    let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
-    let metadata = metadata.metadata().as_ref().ok_or("it has no metadata")?;
-    let value = |key: &str| {
-        metadata
-            .get(key)
-            .ok_or(format!("its metadata has no {key}"))
-    };
-    if value(FORMAT_KEY)? != FORMAT {
-        return Err(format!(
-            "its format is {}, not {FORMAT}",
-            value(FORMAT_KEY)?
-        ));
+/// Returns a safetensors file with `tensors` and this metadata.
+///
+/// # Panics
+/// If there are fewer `values` than the tensors hold.
+pub(crate) fn write_tensors(
+    tensors: &[TensorSpec],
+    values: &[f32],
+    metadata: HashMap<String, String>,
+) -> Vec<u8> {
+    let views = tensors.iter().map(|tensor| {
+        let bytes = bytemuck::cast_slice(&values[tensor.range.clone()]);
+        let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes)
+            .expect("a tensor's range is as long as its shape says");
+        (tensor.name.clone(), view)
+    });
+    safetensors::serialize(views, Some(metadata)).expect("names and shapes are plain data")
+}
+
+/// A file of named f32 tensors, with a configuration and a checksum in its metadata.
+pub(crate) struct ParameterFile<'a> {
+    metadata: HashMap<String, String>,
+    tensors: SafeTensors<'a>,
+}
+
+impl<'a> ParameterFile<'a> {
+    /// Reads the names; errors of all methods are the problem alone.
+    pub(crate) fn parse(bytes: &'a [u8]) -> Result<Self, String> {
+        let (_, metadata) = SafeTensors::read_metadata(bytes).map_err(|error| error.to_string())?;
+        let metadata = metadata.metadata().clone().ok_or("it has no metadata")?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
+        Ok(Self { metadata, tensors })
     }
-    let version = value(VERSION_KEY)?
-        .parse()
-        .map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
-    let config: Config = toml::from_str(value(CONFIG_KEY)?)
-        .map_err(|error| format!("its configuration: {error}"))?;
-    config
-        .validate()
-        .map_err(|error| format!("its configuration: {error}"))?;
-    let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
-    let layout = SnapshotLayout::of(&config);
-    let mut values = Vec::with_capacity(layout.values());
-    for tensor in layout.tensors() {
-        let view = file
-            .tensor(&tensor.name)
-            .map_err(|error| error.to_string())?;
-        if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
-            return Err(format!(
-                "{} is {:?} {:?}, not F32 {:?}",
-                tensor.name,
-                view.dtype(),
-                view.shape(),
-                tensor.shape
-            ));
+
+    /// Returns the text of this metadata key.
+    pub(crate) fn text(&self, key: &str) -> Result<&str, String> {
+        let text = self.metadata.get(key);
+        let text = text.ok_or_else(|| format!("its metadata has no {key}"))?;
+        Ok(text)
+    }
+
+    /// Returns the valid configuration in the metadata.
+    pub(crate) fn config(&self) -> Result<Config, String> {
+        let config: Config = toml::from_str(self.text(CONFIG_KEY)?)
+            .map_err(|error| format!("its configuration: {error}"))?;
+        let valid = config.validate();
+        valid.map_err(|error| format!("its configuration: {error}"))?;
+        Ok(config)
+    }
+
+    /// Returns the finite values of `tensors`, back to back.
+    pub(crate) fn values(&self, tensors: &[TensorSpec]) -> Result<Vec<f32>, String> {
+        let mut values = Vec::new();
+        for tensor in tensors {
+            let view = self.tensors.tensor(&tensor.name);
+            let view = view.map_err(|error| error.to_string())?;
+            if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
+                return Err(format!(
+                    "{} is {:?} {:?}, not F32 {:?}",
+                    tensor.name,
+                    view.dtype(),
+                    view.shape(),
+                    tensor.shape
+                ));
+            }
+            values.extend(values_of(view.data()));
         }
-        values.extend(values_of(view.data()));
+        check_finite(tensors, &values).map_err(|error| error.to_string())?;
+        Ok(values)
     }
-    let snapshot = Snapshot {
-        version: PolicyVersion(version),
-        values,
+
+    /// Compares the file's checksum with that of these metadata texts and values.
+    pub(crate) fn check(&self, texts: &[&str], values: &[f32]) -> Result<(), String> {
+        let (found, expected) = (checksum(texts, values), self.text(CHECKSUM_KEY)?);
+        if found == expected {
+            return Ok(());
+        }
+        Err(format!(
+            "it is damaged: the checksum of its content is {found}, expected {expected}"
+        ))
+    }
+}
+
+fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
+    let file = ParameterFile::parse(bytes)?;
+    let format = file.text(FORMAT_KEY)?;
+    if format != FORMAT {
+        return Err(format!("its format is {format}, not {FORMAT}"));
+    }
+    let version = file.text(VERSION_KEY)?;
+    let number = version.parse();
+    let number = number.map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
+    let config = file.config()?;
+    let values = file.values(SnapshotLayout::of(&config).tensors())?;
+    file.check(&[version, file.text(CONFIG_KEY)?], &values)?;
+    let version = PolicyVersion(number);
+    Ok((Snapshot { version, values }, config))
+}
+
+fn check_finite(tensors: &[TensorSpec], values: &[f32]) -> Result<(), SnapshotError> {
+    let broken = |tensor: &&TensorSpec| {
+        let values = &values[tensor.range.clone()];
+        values.iter().any(|value| !value.is_finite())
     };
-    let found = checksum(value(VERSION_KEY)?, value(CONFIG_KEY)?, &snapshot.values);
-    if *value(CHECKSUM_KEY)? != found {
-        return Err(format!(
-            "it is damaged: the checksum of its content is {found}, expected {}",
-            value(CHECKSUM_KEY)?
-        ));
+    match tensors.iter().find(broken) {
+        Some(tensor) => Err(SnapshotError::NotFinite {
+            tensor: tensor.name.clone(),
+        }),
+        None => Ok(()),
     }
-    snapshot
-        .check_finite(&layout)
-        .map_err(|error| error.to_string())?;
-    Ok((snapshot, config))
 }
 
 /// Reads f32 values from bytes that need not be aligned.

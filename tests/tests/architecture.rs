@@ -150,6 +150,20 @@ fn every_package_has_only_its_allowed_dependencies() {
             &[physics],
         ),
         (
+            "skein-encoder",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-learner",
+                "skein-protocol",
+                "skein-reports",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[],
+        ),
+        (
             "skein-prepare",
             &[
                 "skein-protocol",

@@ -17,6 +17,7 @@
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
 //! | [`text`] | rules for names and lists in files |
+//! | [`viewpoints`] | depth images from random poses |
 
 mod body;
 pub mod camera;
@@ -29,4 +30,5 @@ mod step_report;
 pub mod suite;
 pub mod text;
 pub mod vehicle;
+pub mod viewpoints;
 mod world;

@@ -7,7 +7,8 @@
 //! is longer than that in every direction it can move, so it cannot pass a surface between two
 //! tests.
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rapier3d::math::{Pose, Rotation};
 use rapier3d::parry::bounding_volume::Aabb;
 use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
 use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
@@ -107,31 +108,47 @@ impl World {
 
     /// Returns the wall that the body touches, by its place in course order from 0.
     pub(crate) fn touched_wall(&self) -> Option<usize> {
-        self.walls.iter().position(|wall| self.touches(wall))
+        let (pose, bounds) = (self.body.pose(), &self.bounds);
+        self.walls
+            .iter()
+            .position(|wall| self.touches(pose, bounds, wall))
     }
 
     /// Returns what the body touches.
     pub(crate) fn contact(&self) -> Contact {
-        let (body, inside) = (&self.bounds, &self.interior);
-        let touches_corridor = body.mins.cmple(inside.mins).any()
-            || body.maxs.y >= inside.maxs.y
-            || body.maxs.z >= inside.maxs.z;
-        if touches_corridor || self.touched_wall().is_some() {
+        self.contact_at(self.body.pose(), &self.bounds)
+    }
+
+    /// Returns `true` if a body at `world_from_body` would touch no obstacle.
+    pub(crate) fn is_free_at(&self, world_from_body: &Isometry3<f32>) -> bool {
+        let [x, y, z, w] = world_from_body.rotation.coords.into();
+        let rotation = Rotation::from_xyzw(x, y, z, w);
+        let pose = Pose::from_parts(glam(&world_from_body.translation.vector), rotation);
+        self.contact_at(&pose, &self.body_shape.compute_aabb(&pose)) != Contact::Obstacle
+    }
+
+    /// Returns what a body of these `bounds` touches at `world_from_body`.
+    fn contact_at(&self, world_from_body: &Pose, bounds: &Aabb) -> Contact {
+        let inside = &self.interior;
+        let touches_corridor = bounds.mins.cmple(inside.mins).any()
+            || bounds.maxs.y >= inside.maxs.y
+            || bounds.maxs.z >= inside.maxs.z;
+        let mut walls = self.walls.iter();
+        if touches_corridor || walls.any(|wall| self.touches(world_from_body, bounds, wall)) {
             Contact::Obstacle
-        } else if body.maxs.x >= inside.maxs.x {
+        } else if bounds.maxs.x >= inside.maxs.x {
             Contact::EndWall
         } else {
             Contact::Nothing
         }
     }
 
-    fn touches(&self, wall: &WallBody) -> bool {
-        if !wall.is_near(&self.bounds) {
+    fn touches(&self, world_from_body: &Pose, bounds: &Aabb, wall: &WallBody) -> bool {
+        if !wall.is_near(bounds) {
             return false;
         }
-        let body_from_world = self.body.pose().inverse();
         DefaultQueryDispatcher
-            .intersection_test(&body_from_world, &self.body_shape, &wall.surfaces)
+            .intersection_test(&world_from_body.inverse(), &self.body_shape, &wall.surfaces)
             // Fails for unsupported shapes alone. A failure must never mean "no contact".
             .expect("parry tests a cuboid against a triangle mesh")
             .intersecting

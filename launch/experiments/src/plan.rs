@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_protocol::files::{self, SETTINGS_BYTES};
+use skein_protocol::files::{self, TENSOR_BYTES};
 use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
@@ -264,23 +264,23 @@ impl PlannedRun {
     }
 }
 
-/// Returns the differences between the configuration of `run`, including its courses, and
+/// Returns the differences between the configuration of `run`, including the files it names, and
 /// `expected`. A key that did not exist when the run was made has its default value.
 fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, String> {
     let mut stored =
         skein_prepare::resolve(&run.config(), &[], ACTORS).map_err(|error| with_causes(&error))?;
     let mut expected = expected.clone();
-    let mut courses = Vec::new();
-    for (here, there) in expected.courses.paths_mut().zip(stored.courses.paths_mut()) {
-        // The copy has another name if two course files had the same name.
-        let content = |path: &Path| files::read(path, SETTINGS_BYTES).ok();
+    let mut changed = Vec::new();
+    for (here, there) in expected.files_mut().zip(stored.files_mut()) {
+        // The copy may have another name, because two course files had the same name.
+        let content = |path: &Path| files::read(path, TENSOR_BYTES).ok();
         match content(here) == content(there) {
             true => here.clone_from(there),
-            false => courses.push(format!("the course {} has changed since", here.display())),
+            false => changed.push(format!("{} has changed since", here.display())),
         }
     }
     let keys = expected.differences(&stored.portable());
-    Ok([keys.map_err(|error| error.to_string())?, courses].concat())
+    Ok([keys.map_err(|error| error.to_string())?, changed].concat())
 }
 
 pub(super) fn io_at(path: &Path) -> impl FnOnce(io::Error) -> PlanError {

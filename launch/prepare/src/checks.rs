@@ -1,10 +1,11 @@
-//! Checks that a configuration can be flown: its simulator settings, its courses, and their
-//! combination.
+//! Checks that a configuration can be flown: its simulator settings, its courses, its encoder, and
+//! their combination.
 
 use std::path::Path;
 use std::sync::Arc;
 
 use skein_protocol::config::{Config, ConfirmOn, failing_override};
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::text::first_repeated;
@@ -51,6 +52,10 @@ pub fn check(
                 source,
             })?;
     }
+    TrainedEncoder::of(config).map_err(|source| PrepareError::Encoder {
+        config: in_file(),
+        source,
+    })?;
     check_level_count(
         config_file,
         config,

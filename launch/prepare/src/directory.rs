@@ -86,10 +86,19 @@ impl NewDirectory {
     }
 }
 
-/// Copies the course files into the run's directory and makes the configuration refer to the
+/// Copies course files and encoder into the run's directory and makes the configuration refer to the
 /// copies, so that the run stays reproducible when the originals change.
-pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
-    let folder = RunDirectory::new(root).courses();
+pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
+    let run = RunDirectory::new(root);
+    if let Some(encoder) = &mut config.vae.start_from {
+        copy(encoder, run.encoder())?;
+        *encoder = run
+            .encoder()
+            .file_name()
+            .map(PathBuf::from)
+            .unwrap_or_default();
+    }
+    let folder = run.courses();
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();
     for path in config.courses.paths_mut() {
         let stem = CoursesSection::stem_of(path);
@@ -100,13 +109,17 @@ pub(super) fn copy_courses(root: &Path, config: &mut Config) -> Result<(), Prepa
             }
             name = format!("{stem}_{number}.toml").into();
         }
-        let copy = folder.join(&name);
-        // A copy has the original's mode, whatever the umask.
-        fs::copy(&*path, &copy)
-            .and_then(|_| fs::set_permissions(&copy, Permissions::from_mode(0o600)))
-            .map_err(|source| PrepareError::Io { path: copy, source })?;
+        copy(path, folder.join(&name))?;
         let relative = Path::new("courses").join(&name);
         copies.insert(name, std::mem::replace(path, relative));
     }
     Ok(())
+}
+
+/// Copies a file, for the user only.
+fn copy(from: &Path, to: PathBuf) -> Result<(), PrepareError> {
+    // A copy has the original's mode, whatever the umask.
+    fs::copy(from, &to)
+        .and_then(|_| fs::set_permissions(&to, Permissions::from_mode(0o600)))
+        .map_err(|source| PrepareError::Io { path: to, source })
 }

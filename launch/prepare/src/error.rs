@@ -4,6 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use skein_protocol::config::ConfigError;
+use skein_protocol::encoder_file::EncoderError;
 use skein_run::RunError;
 use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
@@ -36,6 +37,15 @@ pub enum PrepareError {
         /// Problem of the setting.
         #[source]
         source: SimulatorError,
+    },
+    /// The encoder to start from cannot be used.
+    #[error("{}: {source}", config.display())]
+    Encoder {
+        /// The configuration file.
+        config: PathBuf,
+        /// Problem of the encoder's file.
+        #[source]
+        source: EncoderError,
     },
     /// The given ranges do not allow courses to be generated.
     #[error("{}: [simulator.generator] {source}", config.display())]

@@ -81,7 +81,7 @@ pub fn resolve(
 
 /// Fills a new run's directory with the files that its processes need.
 fn fill(new: &NewDirectory, mut config: Config) -> Result<Prepared, PrepareError> {
-    directory::copy_courses(new.root(), &mut config)?;
+    directory::copy_inputs(new.root(), &mut config)?;
     let run = RunDirectory::new(new.root());
     let identity = run.create(&config)?;
     let (_, config) = run.open()?;

@@ -5,6 +5,8 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
+use skein_protocol::encoder_file::TrainedEncoder;
+use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
 
 use super::*;
@@ -47,6 +49,38 @@ fn a_prepared_run_holds_copies_of_all_its_inputs() {
     );
     assert_eq!(prepared.run.open().unwrap().0, prepared.identity);
     let copy = fs::metadata(prepared.run.courses().join("training.toml")).unwrap();
+    assert_eq!(copy.permissions().mode() & 0o777, 0o600);
+}
+
+#[test]
+fn a_run_keeps_the_encoder_that_it_starts_from() {
+    let directory = tempfile::tempdir().unwrap();
+    let original = directory.path().join("mine.safetensors");
+    let text = "[vae]\ntrain_steps = 0\nstart_from = \"mine.safetensors\"";
+    let config = config_file(directory.path(), text);
+    let start = || prepare(&config, &[], &directory.path().join("run"), 2);
+    let error = start().unwrap_err().to_string();
+    for part in [
+        "test.toml",
+        "vae.start_from",
+        "mine.safetensors",
+        "No such file",
+    ] {
+        assert!(error.contains(part), "{error}");
+    }
+
+    let trained = TrainedEncoder {
+        values: vec![0.25; SnapshotLayout::of(&Config::default()).encoder().len()],
+        latent: Config::default().vae.latent,
+    };
+    fs::write(&original, trained.to_file(&Config::default(), 9)).unwrap();
+    let prepared = start().unwrap();
+    fs::remove_file(&original).unwrap();
+    let (identity, config) = prepared.run.open().unwrap();
+    assert!(identity.encoder.is_some());
+    assert_eq!(config.vae.start_from, Some(prepared.run.encoder()));
+    assert_eq!(TrainedEncoder::of(&config).unwrap(), Some(trained));
+    let copy = fs::metadata(prepared.run.encoder()).unwrap();
     assert_eq!(copy.permissions().mode() & 0o777, 0o600);
 }
 

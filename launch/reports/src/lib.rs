@@ -160,6 +160,24 @@ pub fn draw_all(
     plots
 }
 
+/// Draws depth images above their reconstructions, both `[n, 72, 128]`, to `path`.
+///
+/// # Errors
+/// Returns [`ReportError`] if there are not as many of both, or the picture cannot be drawn or
+/// written.
+pub fn draw_reconstructions(
+    depth: &[u8],
+    reconstructions: &[u8],
+    path: &Path,
+) -> Result<(), ReportError> {
+    let pairs = reconstructions::Pairs::of(depth.to_vec(), reconstructions.to_vec());
+    let pairs = pairs.map_err(|problem| ReportError::Malformed {
+        path: path.to_owned(),
+        problem,
+    })?;
+    reconstructions::draw(&pairs, path)
+}
+
 /// Reads a file if it exists and is valid.
 fn existing<T>(
     path: PathBuf,

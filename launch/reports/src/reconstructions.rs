@@ -54,11 +54,16 @@ impl Pairs {
                 ))),
             }
         };
-        let (depth, reconstruction) = (images("depth")?, images("reconstruction")?);
+        Self::of(images("depth")?, images("reconstruction")?).map_err(malformed)
+    }
+
+    /// Pairs whole images with their reconstructions.
+    ///
+    /// # Errors
+    /// If their numbers differ or are zero.
+    pub(super) fn of(depth: Vec<u8>, reconstruction: Vec<u8>) -> Result<Self, String> {
         if depth.is_empty() || depth.len() != reconstruction.len() {
-            return Err(malformed(
-                "the numbers of images and reconstructions differ or are zero".to_owned(),
-            ));
+            return Err("the numbers of images and reconstructions differ or are zero".to_owned());
         }
         Ok(Self {
             depth,

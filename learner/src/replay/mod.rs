@@ -44,7 +44,7 @@ pub struct Replay {
     success: Ring,
     regular: Ring,
     /// Depth images: kept until the VAE is frozen, or for the whole run where the policy learns
-    /// from them.
+    /// from them; never where the run starts from a trained encoder.
     images: Option<ImageStore>,
     /// Training of the encoder, hence the use of the images.
     encoder: EncoderTraining,
@@ -137,7 +137,11 @@ impl Replay {
             view,
             success: Ring::new(success, layout),
             regular: Ring::new(regular, layout),
-            images: Some(ImageStore::new(image_limit(config))),
+            images: config
+                .vae
+                .start_from
+                .is_none()
+                .then(|| ImageStore::new(image_limit(config))),
             encoder: config.learning.encoder,
             sweep_above: config.replay.capacity + config.replay.capacity / 4 + epoch_images(config),
             last: None,

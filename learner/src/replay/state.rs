@@ -58,10 +58,10 @@ impl Replay {
         replay.regular =
             Ring::restore(regular, layout, state.regular).map_err(fail("regular part"))?;
         match state.images {
-            Some(blocks) => replay
-                .images
-                .iter_mut()
-                .try_for_each(|store| fill(store, &blocks)),
+            Some(blocks) => match &mut replay.images {
+                Some(store) => fill(store, &blocks),
+                None => Err("there are some, and nothing would learn from them".to_owned()),
+            },
             None if config.learning.end_to_end() => {
                 Err("there are none, and the policy learns from them".to_owned())
             }

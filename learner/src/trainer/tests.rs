@@ -263,7 +263,7 @@ fn a_u_net_runs_on_libtorch_and_leaves_the_policys_start_unchanged() {
     let mut config = config();
     config.vae.decoder = DecoderName::UNet;
     let mut trainer = Trainer::new(&config).unwrap();
-    assert!(matches!(trainer.vae, Some(Vae::Libtorch(_))));
+    assert!(matches!(trainer.source.vae(), Some(Vae::Libtorch(_))));
     let policy = |trainer: &mut Trainer| {
         let mut parts = trainer.algorithm.named_tensors();
         parts.sort_by(|left, right| left.name.cmp(&right.name));
@@ -478,6 +478,45 @@ fn mirrored_or_not_an_episode_of_an_older_encoder_is_encoded_again() {
 }
 
 #[test]
+fn a_trained_encoder_flies_from_the_first_episode_on_and_nothing_keeps_images() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("encoder.safetensors");
+    let mut config = config();
+    (config.vae.train_steps, config.vae.start_from) = (0, Some(path.clone()));
+    config.replay.capacity = 1000;
+    config.learning.mirror = true;
+    config.learning.observation = Observation::LatentVelocityAction;
+    config.learning.policy_lag = 1;
+    let missing = Trainer::new(&config).unwrap_err().to_string();
+    assert!(missing.contains("vae.start_from"), "{missing}");
+
+    let len = SnapshotLayout::of(&config).encoder().len();
+    let trained = TrainedEncoder {
+        values: (0..len).map(|index| 0.01 * (index as f32).sin()).collect(),
+        latent: config.vae.latent,
+    };
+    std::fs::write(&path, trained.to_file(&config, 9)).unwrap();
+    let undisturbed = train(&config, 1, &[]);
+    assert_eq!(undisturbed.progress.vae_steps, 0);
+    assert!(undisturbed.progress.policy_updates > 10);
+    assert!(undisturbed.replay.images.is_none());
+    assert!(train(&config, 1, &[1, 2, 4]) == undisturbed, "resumed");
+    assert_eq!(undisturbed.snapshots[0].values[..len], trained.values);
+
+    // Images come for the mirror alone. The mirrored half is encoded, the other half's codes are
+    // the actors' and are believed.
+    let mut trainer = Trainer::new(&config).unwrap();
+    assert_eq!(trainer.keep(), KeptData::Depth);
+    assert_eq!(trainer.reconstruct(&[0; IMAGE_PIXELS]), None);
+    learn(&mut trainer, 0, KeptData::Depth);
+    let (encoded, all) = encoded_rows(&trainer, 1);
+    assert!(0 < encoded && encoded < all, "{encoded} of {all}");
+
+    config.learning.mirror = false;
+    assert_eq!(Trainer::new(&config).unwrap().keep(), KeptData::Latents);
+}
+
+#[test]
 fn a_restored_trainer_does_not_recode_before_it_is_due() {
     let mut config = config();
     (config.vae.recode_steps, config.vae.train_steps) = (2 * STEPS, 100 * STEPS);
@@ -506,7 +545,7 @@ fn updates_from_another_snapshot_draw_other_minibatches_and_noise() {
             take_in(&mut trainer, epoch, KeptData::Depth);
             update(&mut trainer, PolicyVersion(version));
         }
-        let vae = trainer.vae.as_mut().unwrap().named_tensors();
+        let vae = trainer.source.vae_mut().unwrap().named_tensors();
         (vae, trainer.algorithm.named_tensors())
     };
     let (first, again, other) = (after([0, 1]), after([0, 1]), after([0, 2]));
@@ -527,6 +566,12 @@ fn updates_from_another_snapshot_draw_other_minibatches_and_noise() {
 /// `true` if the stored codes of the first `epochs` are those that actors would compute with the
 /// present encoder.
 fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
+    let (encoded, all) = encoded_rows(trainer, epochs);
+    encoded == all
+}
+
+/// Number of rows drawn of the first `epochs` whose code is the present encoder's, and of all drawn.
+fn encoded_rows(trainer: &Trainer, epochs: u64) -> (usize, usize) {
     let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout);
     let code = |(episode, step)| {
         network.encode(
@@ -541,11 +586,12 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     let mut drawn = Minibatch::default();
     let mut rng = Pcg64Mcg::seed_from_u64(9);
     trainer.replay().sample(&mut rng, 200, &mut drawn);
-    let mut rows = drawn.observations.chunks(drawn.observations.len() / 200);
+    let rows = drawn.observations.chunks(drawn.observations.len() / 200);
     let latent = trainer.config.vae.latent;
-    rows.all(|observation| {
+    let encoded = rows.filter(|observation| {
         codes
             .iter()
             .any(|code| code[..latent] == observation[..latent])
-    })
+    });
+    (encoded.count(), 200)
 }

@@ -7,19 +7,18 @@ use skein_protocol::snapshot::SnapshotError;
 
 use crate::UpdateError;
 use crate::checkpoint::CheckpointError;
-use crate::device::DeviceError;
 use crate::episodes::ReceiverError;
 use crate::evaluation::EvaluationWriteError;
 use crate::metrics::MetricsError;
 use crate::replay::InsertError;
-use crate::trainer::TrainerRestoreError;
+use crate::trainer::{TrainerError, TrainerRestoreError};
 
 /// Reason why a training ended early.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs)] // every variant is named after the part that failed
 pub enum TrainingError {
     #[error(transparent)]
-    Device(#[from] DeviceError),
+    Trainer(#[from] TrainerError),
     #[error(transparent)]
     EpisodeReceiver(#[from] ReceiverError),
     #[error(transparent)]

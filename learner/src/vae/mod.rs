@@ -17,7 +17,7 @@ use crate::error::UpdateError;
 use crate::noise::Noise;
 use crate::state::{StatePart, Stateful};
 
-pub use native::{LAYERS, LayerTimes, NativeVae, Pass};
+pub use native::{LAYERS, LayerTimes, NativeVae, Pass, Targets};
 pub use torch::{TorchVae, images_from_bytes};
 
 /// Encoder, decoder and their optimizer, computed by the configured engine.

@@ -10,6 +10,7 @@ mod batch;
 mod buffer;
 mod code;
 mod elementwise;
+mod geometry;
 mod layer;
 mod members;
 mod network;
@@ -26,6 +27,7 @@ use skein_protocol::seeds::{Purpose, derive};
 use self::batch::BatchBuffers;
 use self::buffer::Buffer;
 use self::elementwise::{sigmoids, squares};
+use self::geometry::GeometryHead;
 use self::members::{MemberScratch, by_image, share};
 use self::network::VaeNetwork;
 use self::parameter_order::ParameterOrder;
@@ -36,6 +38,7 @@ use crate::networks::{DecoderNetwork, EncoderNetwork, Layout};
 use crate::noise::Noise;
 use crate::state::{StatePart, Stateful};
 
+pub use step::Targets;
 pub use stopwatch::{LAYERS, LayerTimes, Pass};
 
 /// Images reconstructed at once: bounds memory, and reads the weights once for all of them.
@@ -60,6 +63,8 @@ pub struct NativeVae {
     gradient: Buffer,
     batch: BatchBuffers,
     noise: Vec<f32>,
+    /// Second head on the code; `None` where the caller knows no geometry.
+    geometry: Option<GeometryHead>,
     steps: u64,
     learning_rate: f64,
     kl_weight: f64,
@@ -92,6 +97,7 @@ impl NativeVae {
             gradient: Buffer::zeroed(len),
             batch: BatchBuffers::default(),
             noise: Vec::new(),
+            geometry: None,
             steps: 0,
             learning_rate: section.learning_rate,
             kl_weight: section.kl_weight,
@@ -102,28 +108,66 @@ impl NativeVae {
         vae
     }
 
+    /// Returns the same VAE with a second head, which regresses `outputs` numbers from the code.
+    /// `weight`: factor of its squared error in the loss.
+    pub fn with_geometry(mut self, outputs: usize, weight: f64, run_seed: u64) -> Self {
+        let seed = derive(run_seed, Purpose::VaeParameters, 1);
+        let head = GeometryHead::new(self.isa, self.network.latent(), outputs, weight, seed);
+        self.geometry = Some(head);
+        self
+    }
+
+    /// Sets Adam's step size from the next step on.
+    pub fn set_learning_rate(&mut self, learning_rate: f64) {
+        self.learning_rate = learning_rate;
+    }
+
     /// Makes one step of Adam on a minibatch of depth images, `[n, 72, 128]`.
     ///
     /// # Errors
     /// [`UpdateError::NonFinite`] names the value that was not finite and the step's number;
     /// nothing has changed then.
     pub fn update(&mut self, images: &[u8], noise: &mut Noise) -> Result<VaeMetrics, UpdateError> {
+        let objective = self.update_towards(images, Targets::default(), noise)?;
+        Ok(metrics(&objective))
+    }
+
+    /// Makes one step of Adam on depth images whose `targets` are known. Returns the metrics, and
+    /// the geometry's part of the loss.
+    ///
+    /// # Errors
+    /// As [`NativeVae::update`].
+    ///
+    /// # Panics
+    /// When the targets do not belong to as many images, or the geometry has no head.
+    pub fn update_supervised(
+        &mut self,
+        images: &[u8],
+        targets: Targets<'_>,
+        noise: &mut Noise,
+    ) -> Result<(VaeMetrics, f32), UpdateError> {
+        let objective = self.update_towards(images, targets, noise)?;
+        Ok((metrics(&objective), objective.geometry))
+    }
+
+    fn update_towards(
+        &mut self,
+        images: &[u8],
+        targets: Targets<'_>,
+        noise: &mut Noise,
+    ) -> Result<LossParts, UpdateError> {
         let count = images.len() / IMAGE_PIXELS;
         self.noise.resize(count * self.network.latent(), 0.0);
         noise.fill_normal(&mut self.noise);
 
-        let objective = self.objective(images);
+        let objective = self.objective(images, targets);
         self.check(&objective)?;
         self.step();
-        Ok(VaeMetrics {
-            loss: objective.loss,
-            pixel_error: objective.error / IMAGE_PIXELS as f32,
-            divergence: objective.divergence,
-        })
+        Ok(objective)
     }
 
     /// Computes loss and gradient for these images and `self.noise`.
-    fn objective(&mut self, images: &[u8]) -> LossParts {
+    fn objective(&mut self, images: &[u8], targets: Targets<'_>) -> LossParts {
         self.pack();
         let mut step = StepContext {
             isa: self.isa,
@@ -133,8 +177,9 @@ impl NativeVae {
             batch: &mut self.batch,
             parameters: &self.parameters,
             kl_weight: self.kl_weight,
+            geometry: self.geometry.as_mut(),
         };
-        step.objective(images, &self.noise, &mut self.gradient)
+        step.objective(images, targets, &self.noise, &mut self.gradient)
     }
 
     /// Checks that everything a step would use is finite. For the gradient, its squared norm must
@@ -148,7 +193,8 @@ impl NativeVae {
             + self
                 .network
                 .unfold
-                .gradient_bound(self.isa, &self.batch.unfolded);
+                .gradient_bound(self.isa, &self.batch.unfolded)
+            + self.geometry.as_ref().map_or(0.0, GeometryHead::squares);
         watch.rest();
         for (tensor, value) in [
             ("vae loss", objective.loss),
@@ -199,6 +245,9 @@ impl NativeVae {
             adam.apply(&mut self.team, isa, parameters, gradient, moments);
         }
         self.network.pack(&mut self.team, &self.parameters);
+        if let Some(head) = &mut self.geometry {
+            head.step(&mut self.team, learning_rate);
+        }
         watch.adam_and_packing();
     }
 
@@ -323,6 +372,14 @@ impl NativeVae {
     }
 }
 
+fn metrics(objective: &LossParts) -> VaeMetrics {
+    VaeMetrics {
+        loss: objective.loss,
+        pixel_error: objective.error / IMAGE_PIXELS as f32,
+        divergence: objective.divergence,
+    }
+}
+
 #[cfg(test)]
 impl NativeVae {
     /// Sets the first number of a tensor to `value`.
@@ -344,7 +401,8 @@ impl NativeVae {
             loss,
             error,
             divergence,
-        } = self.objective(images);
+            ..
+        } = self.objective(images, Targets::default());
         let (mut whole, place) = (
             self.gradient.to_vec(),
             self.network.unfold.place.weight.clone(),
@@ -378,6 +436,7 @@ impl Stateful for NativeVae {
             ("adam.steps", StatePart::Count(&mut self.steps)),
         ];
         let named = |(name, part)| (format!("vae.native.{name}"), part);
-        parts.into_iter().map(named).collect()
+        let head = self.geometry.iter_mut().flat_map(GeometryHead::parts);
+        parts.into_iter().map(named).chain(head).collect()
     }
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::{RunIdentity, courses, durable};
+use crate::{RunIdentity, durable, inputs};
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::{Config, ConfigError};
 use skein_protocol::files::{self, REPORT_BYTES, SETTINGS_BYTES};
@@ -42,6 +42,8 @@ impl RunDirectory {
         identity => "run.json",
         /// Copies of the course files, so that the directory is complete.
         courses => "courses",
+        /// Copy of the encoder that the run starts from, where `vae.start_from` names one.
+        encoder => "encoder.safetensors",
         /// Log files, one per process.
         logs => "logs",
         /// Lock file that the learner holds while it is alive, see
@@ -111,8 +113,8 @@ impl RunDirectory {
     }
 
     /// Creates the directory with its folders, accessible to this user only. Writes the resolved
-    /// configuration and a new identity, which holds the checksums of the course files already
-    /// there.
+    /// configuration and a new identity, which holds the checksums of course files and encoder
+    /// already there.
     ///
     /// # Errors
     /// [`RunError`] names the path.
@@ -130,14 +132,16 @@ impl RunDirectory {
         // Synced to disk: after a power cut there must be no checkpoints of a run without an
         // identity.
         let resolved = self.write_config(config)?;
-        let courses = courses::checksums(&self.courses()).map_err(io(self.courses()))?;
-        for file in courses.keys().map(|name| self.courses().join(name)) {
+        let courses = inputs::course_checksums(&self.courses()).map_err(io(self.courses()))?;
+        let encoder = inputs::encoder_checksum(&self.encoder()).map_err(io(self.encoder()))?;
+        let copies = courses.keys().map(|name| self.courses().join(name));
+        for file in copies.chain(encoder.is_some().then(|| self.encoder())) {
             durable::sync(&file).map_err(io(file))?;
         }
         if !courses.is_empty() {
             durable::sync(&self.courses()).map_err(io(self.courses()))?;
         }
-        let identity = RunIdentity::new(&resolved, courses);
+        let identity = RunIdentity::new(&resolved, courses, encoder);
         self.write_identity(&identity)?;
         Ok(identity)
     }
@@ -178,8 +182,8 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Reads identity and configuration of an existing run, and checks that its course files are
-    /// those it was started with.
+    /// Reads identity and configuration of an existing run, and checks that its course files and its
+    /// encoder are those it was started with.
     ///
     /// # Errors
     /// [`RunError`] names the file and the problem.
@@ -232,6 +236,9 @@ impl RunDirectory {
         for course in config.courses.paths_mut() {
             *course = Path::new("courses").join(course.file_name().unwrap_or_default());
         }
+        if let Some(encoder) = &mut config.vae.start_from {
+            *encoder = encoder.file_name().map(PathBuf::from).unwrap_or_default();
+        }
         identity.config_digest = self.write_config(&config)?.digest();
         self.write_identity(&identity)?;
         self.open()
@@ -268,7 +275,8 @@ impl RunDirectory {
                 differences: self.differences(&identity, &config),
             });
         }
-        courses::verify(&self.courses(), &identity.courses, &config)?;
+        inputs::verify_courses(&self.courses(), &identity.courses, &config)?;
+        inputs::verify_encoder(&self.encoder(), identity.encoder.as_deref(), &config)?;
         Ok((identity, config))
     }
 }
@@ -388,6 +396,15 @@ pub enum RunError {
         start a new run", path.display())]
     CourseChanged {
         /// The course file.
+        path: PathBuf,
+        /// The problem.
+        problem: String,
+    },
+    /// The encoder's file is not the one the run was started with.
+    #[error("{} {problem}: the run would mix the codes of different encoders; restore the file, or \
+        start a new run", path.display())]
+    EncoderChanged {
+        /// The file.
         path: PathBuf,
         /// The problem.
         problem: String,
@@ -548,18 +565,60 @@ mod tests {
         refused(&elsewhere, "is not one of the courses");
     }
 
+    /// Returns the configuration of a run that starts from the encoder in its directory.
+    fn started_from_encoder() -> Config {
+        let mut config = Config::default();
+        config.vae.train_steps = 0;
+        config.vae.start_from = Some("encoder.safetensors".into());
+        config
+    }
+
     #[test]
-    fn a_run_can_be_moved() {
+    fn a_changed_or_missing_encoder_is_refused_by_name() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        fs::write(run.encoder(), "parameters").unwrap();
+        run.create(&started_from_encoder()).unwrap();
+        let (_, config) = run.open().unwrap();
+        assert_eq!(config.vae.start_from, Some(run.encoder()));
+        let refused = |problem: &str| {
+            let error = run.open().unwrap_err().to_string();
+            for part in [run.encoder().to_str().unwrap(), problem] {
+                assert!(error.contains(part), "{error}");
+            }
+        };
+        fs::write(run.encoder(), "others").unwrap();
+        refused("has changed");
+        fs::remove_file(run.encoder()).unwrap();
+        refused("No such file");
+        fs::write(run.encoder(), "parameters").unwrap();
+        run.open().unwrap();
+
+        // The digest ignores folders, but an encoder elsewhere is still another encoder.
+        let mut elsewhere = config;
+        elsewhere.vae.start_from = Some(directory.path().join("other/encoder.safetensors"));
+        fs::write(run.config(), elsewhere.to_toml()).unwrap();
+        refused("vae.start_from");
+    }
+
+    #[test]
+    fn a_run_can_be_moved_and_then_lengthened() {
         let directory = tempfile::tempdir().unwrap();
         let (before, after) = (
             directory.path().join("before"),
             directory.path().join("after"),
         );
         let run = RunDirectory::new(&before);
-        run.create(&Config::default()).unwrap();
+        fs::create_dir(&before).unwrap();
+        fs::write(run.encoder(), "parameters").unwrap();
+        let begun = run.create(&started_from_encoder()).unwrap();
         fs::rename(&before, &after).unwrap();
-        let (_, moved) = RunDirectory::new(&after).open().unwrap();
+        let run = RunDirectory::new(&after);
+        let (_, moved) = run.open().unwrap();
         assert_eq!(moved.courses.training, after.join("courses/training.toml"));
+        assert_eq!(moved.vae.start_from, Some(run.encoder()));
+        let (identity, _) = run.lengthen(moved.run.episodes + 1).unwrap();
+        assert_eq!(identity.encoder, begun.encoder);
     }
 
     #[test]

@@ -36,6 +36,10 @@ pub struct RunIdentity {
     /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) at
     /// the start of the run, by file name.
     pub courses: BTreeMap<String, String>,
+    /// Checksum of [`encoder`](super::RunDirectory::encoder) at the start of the run, likewise;
+    /// `None` where the run trains its own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub encoder: Option<String>,
 }
 
 /// Number of a learner start, counted since the first of the run's living processes started. It is
@@ -70,7 +74,11 @@ impl LearnerIncarnation {
 }
 
 impl RunIdentity {
-    pub(super) fn new(config: &Config, courses: BTreeMap<String, String>) -> Self {
+    pub(super) fn new(
+        config: &Config,
+        courses: BTreeMap<String, String>,
+        encoder: Option<String>,
+    ) -> Self {
         let nanos = SystemTime::now()
             .duration_since(UNIX_EPOCH)
             .map_or(0, |elapsed| elapsed.as_nanos() as u64);
@@ -79,6 +87,7 @@ impl RunIdentity {
             run: RunId(nanos ^ u64::from(std::process::id()).rotate_left(48)),
             config_digest: config.digest(),
             courses,
+            encoder,
         }
     }
 
@@ -278,7 +287,7 @@ mod tests {
         // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39
         // digits.
         const ROOM: usize = 108 - 1 - "/".len() - ".event".len() - 39;
-        let identity = RunIdentity::new(&Config::default(), BTreeMap::new());
+        let identity = RunIdentity::new(&Config::default(), BTreeMap::new(), None);
         let incarnation = LearnerIncarnation(9999);
         assert!(
             identity.incarnation_folder(incarnation).as_os_str().len()
@@ -290,7 +299,7 @@ mod tests {
     #[test]
     fn a_process_that_does_not_match_is_refused_with_what_differs() {
         let config = Config::default();
-        let identity = RunIdentity::new(&config, BTreeMap::new());
+        let identity = RunIdentity::new(&config, BTreeMap::new(), None);
         let announcement = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
         assert_eq!(announcement.check(&identity, &config), Ok(()));
         let refusal = |identity: &RunIdentity, config: &Config| {

@@ -14,13 +14,13 @@
 pub mod allocation;
 mod claims;
 pub mod control_groups;
-mod courses;
 mod directory;
 pub mod durable;
 mod event_records;
 pub mod failure;
 pub mod fault;
 mod identity;
+mod inputs;
 mod lock;
 pub mod log_tail;
 pub mod logging;

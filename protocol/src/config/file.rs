@@ -102,8 +102,8 @@ const SHIPPED_CONFIGS: &str = "SKEIN_CONFIGS";
 
 impl Config {
     /// Reads `path`, applies `overrides` (`section.key=value`, the value in TOML's notation or a
-    /// bare word) and validates the result. Course paths in the file are relative to the file,
-    /// those in an override to the working directory.
+    /// bare word) and validates the result. Paths in the file are relative to the file, those in an
+    /// override to the working directory.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy, and the override that caused it.
@@ -187,12 +187,14 @@ impl Config {
         for course in &mut config.courses.evaluation {
             *course = evaluation.join(&*course);
         }
-        for course in config.courses.paths() {
-            if course.to_str().is_none() {
+        if let Some(encoder) = &mut config.vae.start_from {
+            *encoder = directory.join(&*encoder);
+        }
+        for file in config.files() {
+            if file.to_str().is_none() {
                 let message = format!(
-                    "[courses] {} is not UTF-8 and cannot be stored in the files of a run; \
-                    rename the folder",
-                    course.display()
+                    "{} is not UTF-8 and cannot be stored in the files of a run; rename the folder",
+                    file.display()
                 );
                 return Err(ConfigError::Key {
                     path: path.to_owned(),
@@ -204,16 +206,15 @@ impl Config {
     }
 
     /// Returns this configuration, read from `path`, with `overrides` as in [`Config::load`].
-    /// Course paths stay as they are.
+    /// Paths stay as they are.
     ///
     /// # Errors
     /// [`ConfigError`] names file, key, value and remedy.
     pub fn overridden(&self, path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let changed = Self::parse_with(&self.to_toml(), path, overrides, None)?;
-        Ok(Self {
-            courses: self.courses.clone(),
-            ..changed
-        })
+        let mut changed = Self::parse_with(&self.to_toml(), path, overrides, None)?;
+        changed.courses.clone_from(&self.courses);
+        changed.vae.start_from.clone_from(&self.vae.start_from);
+        Ok(changed)
     }
 
     /// Returns the whole configuration as TOML, defaults included.
@@ -277,6 +278,7 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     section(&mut table, "distill", &mut config.distill)?;
     section(&mut table, "teacher", &mut config.teacher)?;
     section(&mut table, "vae", &mut config.vae)?;
+    section(&mut table, "encoder", &mut config.encoder)?;
     section(&mut table, "replay", &mut config.replay)?;
     section(&mut table, "evaluation", &mut config.evaluation)?;
     section(&mut table, "checkpoints", &mut config.checkpoints)?;
@@ -286,7 +288,7 @@ fn from_table(mut table: Table) -> Result<Config, String> {
         None => Ok(config),
         Some(unknown) => Err(format!(
             "unknown section [{unknown}]; known are run, courses, learning, sac, td3, \
-            distill, teacher, vae, replay, evaluation, checkpoints, transport, simulator"
+            distill, teacher, vae, encoder, replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }
@@ -313,7 +315,7 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
             .ok_or_else(|| fail("names a value where a section is expected"))?;
     }
     let mut value = parse_value(value.trim()).map_err(fail)?;
-    if matches!((sections, key), ("courses", "training" | "evaluation")) {
+    if FILE_KEYS.contains(&path.trim()) {
         make_absolute(&mut value)
             .map_err(|error| fail(&format!("is not a usable path ({error})")))?;
     }
@@ -321,8 +323,11 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
     Ok(())
 }
 
-/// Makes course paths absolute: paths on the command line are relative to the working directory,
-/// not to the configuration file. Other values are left for validation to refuse.
+/// Keys that name files.
+pub const FILE_KEYS: [&str; 3] = ["courses.training", "courses.evaluation", "vae.start_from"];
+
+/// Makes paths absolute: paths on the command line are relative to the working directory, not to the
+/// configuration file. Other values are left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {
@@ -454,11 +459,13 @@ mod tests {
     }
 
     #[test]
-    fn course_paths_are_relative_to_the_file() {
-        let config = load("[courses]\ntraining = \"a/b.toml\"", &[]).unwrap();
-        assert!(
-            config.courses.training.is_absolute() && config.courses.training.ends_with("a/b.toml")
-        );
+    fn paths_are_relative_to_the_file() {
+        let text = "[courses]\ntraining = \"a/b.toml\"\n\
+            [vae]\ntrain_steps = 0\nstart_from = \"c.safetensors\"";
+        let config = load(text, &[]).unwrap();
+        let folder = config.courses.training.ancestors().nth(2).unwrap();
+        assert!(folder.is_absolute() && config.courses.training.ends_with("a/b.toml"));
+        assert_eq!(config.vae.start_from, Some(folder.join("c.safetensors")));
     }
 
     #[test]
@@ -489,16 +496,19 @@ mod tests {
     }
 
     #[test]
-    fn course_paths_in_overrides_are_relative_to_the_working_directory() {
+    fn paths_in_overrides_are_relative_to_the_working_directory() {
         let here = std::env::current_dir().unwrap();
         let config = load(
             "",
             &[
                 "courses.training=a/b.toml",
                 "courses.evaluation=[\"c.toml\", \"/d.toml\"]",
+                "vae.start_from=e.safetensors",
+                "vae.train_steps=0",
             ],
         )
         .unwrap();
+        assert_eq!(config.vae.start_from, Some(here.join("e.safetensors")));
         assert_eq!(config.courses.training, here.join("a/b.toml"));
         assert_eq!(
             config.courses.evaluation,
@@ -776,6 +786,26 @@ mod tests {
                 "[vae]\nlatent = 0",
                 vec![],
                 vec!["test.toml", "vae.latent = 0"],
+            ),
+            (
+                "[vae]\ntrain_steps = 0",
+                vec![],
+                vec!["vae.train_steps = 0", "vae.start_from"],
+            ),
+            (
+                "[vae]\ntrain_steps = 10",
+                vec!["vae.start_from=e.safetensors"],
+                vec![
+                    "--set vae.start_from=e.safetensors",
+                    "vae.train_steps = 10",
+                    "e.safetensors",
+                    "set it to 0",
+                ],
+            ),
+            (
+                "[learning]\nencoder = \"end-to-end\"\n[vae]\ntrain_steps = 0",
+                vec!["vae.start_from=e.safetensors"],
+                vec!["vae.start_from = ", "end-to-end", "leave it out"],
             ),
             (
                 "[td3]\ncritic_networks = 0",

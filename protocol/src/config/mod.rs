@@ -6,6 +6,7 @@
 
 mod courses;
 mod distill;
+mod encoder;
 mod evaluation;
 mod file;
 mod learning;
@@ -18,14 +19,17 @@ mod teacher;
 mod transport;
 mod vae;
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 use crate::segment::MAX_PRIOR_ACTIONS;
 
 pub use courses::CoursesSection;
 pub use distill::DistillSection;
+pub use encoder::EncoderSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
-pub use file::{ConfigError, failing_override, integer_too_large};
+pub use file::{ConfigError, FILE_KEYS, failing_override, integer_too_large};
 pub use learning::{
     AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
 };
@@ -57,6 +61,8 @@ pub struct Config {
     pub teacher: TeacherSection,
     /// Variational auto-encoder.
     pub vae: VaeSection,
+    /// Encoder trained before any run.
+    pub encoder: EncoderSection,
     /// Split replay buffer.
     pub replay: ReplaySection,
     /// Evaluation episodes.
@@ -82,6 +88,16 @@ impl Config {
             AlgorithmName::Td3 => ("td3.batch_size", self.td3.batch_size),
             AlgorithmName::Distill => ("distill.batch_size", self.distill.batch_size),
         }
+    }
+
+    /// Returns every file that the configuration names.
+    pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
+        self.courses.paths().chain(&self.vae.start_from)
+    }
+
+    /// Returns every file that the configuration names, mutable.
+    pub fn files_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
+        self.courses.paths_mut().chain(&mut self.vae.start_from)
     }
 
     /// Returns the layout of the policy's observation.
@@ -116,6 +132,7 @@ impl Config {
         self.distill.validate()?;
         self.teacher.validate()?;
         self.vae.validate()?;
+        self.encoder.validate()?;
         self.replay.validate()?;
         self.evaluation.validate()?;
         self.checkpoints.validate()?;
@@ -164,6 +181,15 @@ impl Config {
             "does not go with learning.encoder = \"end-to-end\", where there is no VAE: set it \
             to \"plain\", or learning.encoder to \"vae\"",
         )?;
+        if let Some(file) = &self.vae.start_from {
+            require(
+                !end_to_end,
+                "vae.start_from",
+                format!("\"{}\"", file.display()),
+                "does not go with learning.encoder = \"end-to-end\", which trains an encoder of \
+                its own: leave it out, or set learning.encoder to \"vae\"",
+            )?;
+        }
         require(
             !end_to_end || self.replay.capacity <= MAX_CAPACITY_WITH_IMAGES,
             "replay.capacity",

@@ -10,12 +10,12 @@ use xxhash_rust::xxh3::xxh3_64;
 use super::Config;
 
 impl Config {
-    /// Returns the whole configuration as TOML, with only the names of course files, so that a
-    /// run's directory can be moved.
+    /// Returns the whole configuration as TOML, with only the names of the files that it names, so
+    /// that a run's directory can be moved.
     pub fn portable(&self) -> String {
         let mut portable = self.clone();
-        for course in portable.courses.paths_mut() {
-            *course = course.file_name().map(PathBuf::from).unwrap_or_default();
+        for file in portable.files_mut() {
+            *file = file.file_name().map(PathBuf::from).unwrap_or_default();
         }
         portable.to_toml()
     }

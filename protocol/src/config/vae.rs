@@ -1,5 +1,7 @@
 //! The `[vae]` section.
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 use super::{Engine, InvalidValue, RunSection, require, require_learning_rate};
@@ -16,8 +18,13 @@ const LATENTS: [usize; 4] = [8, 16, 32, MAX_LATENT];
 pub struct VaeSection {
     /// Length of the latent code: 8, 16, 32 or 64. Default 32, as in the paper.
     pub latent: usize,
-    /// Environment steps during which the VAE is trained, 1 to 200,000. Then it is frozen and
-    /// stored latent codes are recomputed. Default 10000, as in the paper.
+    /// File with an encoder to fly with from the first episode on, frozen: one that `skein encoder`
+    /// wrote, or any snapshot. Requires `train_steps` = 0. The path is relative to the configuration
+    /// file; with `--set`, to the working directory. Default: none, the VAE is trained along.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start_from: Option<PathBuf>,
+    /// Environment steps during which the VAE is trained, 1 to 200,000; 0 with `start_from`. Then it
+    /// is frozen and stored latent codes are recomputed. Default 10000, as in the paper.
     pub train_steps: usize,
     /// Environment steps after which stored latent codes are recomputed while the VAE is still
     /// trained, so that a policy that learns meanwhile sees the codes of one encoder. 0 recomputes
@@ -42,6 +49,7 @@ impl Default for VaeSection {
     fn default() -> Self {
         Self {
             latent: 32,
+            start_from: None,
             train_steps: 10_000,
             recode_steps: 0,
             updates_per_step: 0.1,
@@ -73,12 +81,25 @@ impl VaeSection {
                 set it to one of them (paper: 32)"
             ),
         )?;
-        require(
-            self.train_steps >= 1,
-            "vae.train_steps",
-            self.train_steps,
-            "is below 1: the policy would see the code of an untrained encoder",
-        )?;
+        match &self.start_from {
+            Some(file) => require(
+                self.train_steps == 0,
+                "vae.train_steps",
+                self.train_steps,
+                format!(
+                    "does not go with vae.start_from = \"{}\": that encoder is frozen from the \
+                    first episode on; set it to 0, or leave vae.start_from out",
+                    file.display()
+                ),
+            ),
+            None => require(
+                self.train_steps >= 1,
+                "vae.train_steps",
+                self.train_steps,
+                "is below 1: the policy would see the code of an untrained encoder; raise it, or \
+                name a trained one in vae.start_from",
+            ),
+        }?;
         require(
             self.train_steps <= 200_000,
             "vae.train_steps",

@@ -85,6 +85,11 @@ impl CameraSettings {
         Ok(())
     }
 
+    /// Returns the tangents of half the angles of view, horizontal and vertical.
+    pub(crate) fn half_view(&self) -> [f32; 2] {
+        MIDDLE_PX.map(|middle_px| middle_px / self.focal_px())
+    }
+
     /// Returns the focal length in pixels: a point at `(right, down, forward)` falls `focal * right
     /// / forward` pixels to the right of the image's middle.
     pub(super) fn focal_px(&self) -> f32 {

@@ -82,7 +82,7 @@ impl OpeningAhead {
         [next(), next()]
     }
 
-    fn of_wall(wall: &Wall, state: &VehicleState) -> Self {
+    pub(crate) fn of_wall(wall: &Wall, state: &VehicleState) -> Self {
         Self::seen(wall.x_m(), wall.safe_point(), wall.clearance_m(), state)
     }
 

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use skein_protocol::config::integer_too_large;
+use skein_protocol::config::{FILE_KEYS, integer_too_large};
 use skein_protocol::files::{self, SETTINGS_BYTES};
 use toml::{Table, Value};
 
@@ -183,7 +183,7 @@ fn flatten(
                 return Err(format!("{key} holds no setting: remove it"));
             }
             Value::Table(inner) => flatten(&key, inner, folder, into)?,
-            value if ["courses.training", "courses.evaluation"].contains(&key.as_str()) => {
+            value if FILE_KEYS.contains(&key.as_str()) => {
                 into.push(format!("{key}={}", within(value, folder)));
             }
             value => into.push(format!("{key}={value}")),

@@ -36,6 +36,11 @@ impl Learned {
         self.steps
     }
 
+    /// Sets the learning rate of the next steps.
+    pub fn set_learning_rate(&mut self, learning_rate: f64) {
+        self.learning_rate = learning_rate;
+    }
+
     /// Makes one step of Adam against the gradient.
     pub fn step(&mut self, team: &mut Team, isa: Isa) {
         self.steps += 1;

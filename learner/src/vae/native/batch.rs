@@ -1,5 +1,7 @@
 //! Buffers of a minibatch, kept between its passes.
 
+use skein_protocol::IMAGE_PIXELS;
+
 use super::buffer::Buffer;
 use super::network::VaeNetwork;
 use super::parameter_order::LayerRanges;
@@ -12,6 +14,8 @@ pub(super) struct BatchBuffers {
     /// Pixels, then the outputs of the encoder's four convolutions after ReLU,
     /// `[n, pixels, channels]` each.
     pub(super) encoder_maps: [Buffer; 5],
+    /// Pixels to reproduce where they are not the input's, `[n, 72, 128]`.
+    pub(super) clean: Buffer,
     /// Mean and log-variance of the latent code, `[n, 2 latent]`.
     pub(super) heads: Buffer,
     /// Sampled latent codes, `[n, latent]`.
@@ -56,6 +60,7 @@ impl BatchBuffers {
         resize(&mut self.decoder_maps, &decoder);
         resize(&mut self.decoder_maps_grad, &decoder[..3]);
         for (buffer, len) in [
+            (&mut self.clean, IMAGE_PIXELS),
             (&mut self.heads, 2 * latent),
             (&mut self.heads_grad, 2 * latent),
             (&mut self.codes, latent),

@@ -11,12 +11,22 @@ use skein_protocol::IMAGE_PIXELS;
 use super::batch::BatchBuffers;
 use super::buffer::Buffer;
 use super::code;
-use super::elementwise::{column_sums, gate, reconstruction_error};
+use super::elementwise::{column_sums, gate, reconstruction_error, scale};
+use super::geometry::GeometryHead;
 use super::layer::ConvLayer;
 use super::members::{MemberScratch, by_image, portions, share};
 use super::network::{DECODER, HEADS, LINEAR, UNFOLD, VaeNetwork};
 use super::parameter_order::LayerRanges;
 use super::stopwatch::Pass;
+
+/// Knowledge about a minibatch, beyond its images.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Targets<'a> {
+    /// Images to reproduce, `[n, 72, 128]`; `None` for the images themselves.
+    pub clean: Option<&'a [u8]>,
+    /// Numbers to regress, `[n, outputs]`, NaN where one is unknown; empty for none.
+    pub geometry: &'a [f32],
+}
 
 /// The loss and its parts; see [`super::super::VaeMetrics`].
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +34,14 @@ pub(super) struct LossParts {
     pub(super) loss: f32,
     pub(super) error: f32,
     pub(super) divergence: f32,
+    pub(super) geometry: f32,
+}
+
+/// Images that the decoder is to reproduce.
+#[derive(Clone, Copy)]
+enum Reproduced {
+    Input,
+    Clean,
 }
 
 /// Everything that the passes of one step read and write.
@@ -35,6 +53,7 @@ pub(super) struct StepContext<'a> {
     pub(super) batch: &'a mut BatchBuffers,
     pub(super) parameters: &'a [f32],
     pub(super) kl_weight: f64,
+    pub(super) geometry: Option<&'a mut GeometryHead>,
 }
 
 impl StepContext<'_> {
@@ -44,24 +63,33 @@ impl StepContext<'_> {
     pub(super) fn objective(
         &mut self,
         depth: &[u8],
+        targets: Targets<'_>,
         noise: &[f32],
         gradient: &mut [f32],
     ) -> LossParts {
         let count = depth.len() / IMAGE_PIXELS;
         self.batch.resize(self.network, count);
+        if let Some(clean) = targets.clean {
+            scale(self.isa, clean, &mut self.batch.clean);
+        }
         self.encode(depth);
         let divergence = self.sample_codes(noise) / count as f64;
-        self.decode_and_backward(count);
+        let towards = match targets.clean {
+            None => Reproduced::Input,
+            Some(_) => Reproduced::Clean,
+        };
+        self.decode_and_backward(towards, count);
         self.unfold_backward();
-        self.code_backward(noise, self.kl_weight / count as f64);
+        let geometry = self.code_backward(targets.geometry, noise, self.kl_weight / count as f64);
         self.encoder_backward(count);
         self.gradients(gradient);
 
         let error = self.batch.errors.iter().sum::<f64>() / count as f64;
         LossParts {
-            loss: (error + self.kl_weight * divergence) as f32,
+            loss: (error + self.kl_weight * divergence + geometry) as f32,
             error: error as f32,
             divergence: divergence as f32,
+            geometry: geometry as f32,
         }
     }
 
@@ -125,16 +153,21 @@ impl StepContext<'_> {
 
     /// Forward through the rest of the decoder, squared error, and backward to its first feature
     /// map.
-    fn decode_and_backward(&mut self, count: usize) {
+    fn decode_and_backward(&mut self, towards: Reproduced, count: usize) {
         let (isa, network, parameters) = (self.isa, &*self.network, self.parameters);
         let BatchBuffers {
             encoder_maps: [pixels, ..],
+            clean,
             decoder_maps: [a, b, c, d],
             decoder_maps_grad: [e, f, g],
             decoder_bias_sums,
             errors,
             ..
         } = &mut *self.batch;
+        let pixels = match towards {
+            Reproduced::Input => pixels,
+            Reproduced::Clean => clean,
+        };
         let buffers: [&mut Buffer; 8] = [a, b, c, d, e, f, g, decoder_bias_sums];
         let images = by_image(buffers.map(|buffer| &mut **buffer), count);
         let mut items: Vec<_> = images.into_iter().zip(errors).collect();
@@ -192,8 +225,9 @@ impl StepContext<'_> {
         );
     }
 
-    /// Backward through linear layer, codes and heads, to the features.
-    fn code_backward(&mut self, noise: &[f32], divergence_weight: f64) {
+    /// Backward through linear layer, geometry head, codes and heads, to the features. Returns the
+    /// geometry's part of the loss.
+    fn code_backward(&mut self, known: &[f32], noise: &[f32], divergence_weight: f64) -> f64 {
         let (network, batch) = (&*self.network, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
@@ -204,6 +238,10 @@ impl StepContext<'_> {
             &mut batch.codes_grad,
         );
         watch.layer(LINEAR, Pass::Backward);
+        let geometry = match &mut self.geometry {
+            Some(head) => head.add_gradient(self.team, &batch.codes, known, &mut batch.codes_grad),
+            None => 0.0,
+        };
         let weight = divergence_weight as f32;
         code::backward(
             self.isa,
@@ -223,6 +261,7 @@ impl StepContext<'_> {
             .heads
             .backward(self.team, &batch.heads_grad, finish, into);
         watch.layer(HEADS, Pass::Backward);
+        geometry
     }
 
     /// Backward through the encoder, to its first feature map.

@@ -1,4 +1,5 @@
-//! Checksums of the copied course files: a run flies exactly the courses it was started with.
+//! Checksums of the copied course files and encoder: a run flies exactly the courses, with exactly
+//! the encoder, that it was started with.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +13,7 @@ use skein_protocol::config::Config;
 use skein_protocol::files::{self, SETTINGS_BYTES};
 
 /// Returns the checksum of each file in `folder` by its name; none if the folder does not exist.
-pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
+pub(super) fn course_checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
     let entries = match fs::read_dir(folder) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(BTreeMap::new()),
         entries => entries?,
@@ -29,7 +30,7 @@ pub(super) fn checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
 }
 
 /// Checks that the files in `folder` match `checksums`, and that the run uses no others.
-pub(super) fn verify(
+pub(super) fn verify_courses(
     folder: &Path,
     checksums: &BTreeMap<String, String>,
     config: &Config,
@@ -54,21 +55,58 @@ pub(super) fn verify(
         let problem = if Path::new(name).file_name() != Some(name.as_ref()) {
             Some("is not a file name".to_owned())
         } else {
-            match checksum(&path) {
-                Ok(found) => (found != *expected).then(|| {
-                    format!(
-                        "has changed since the run was started: its checksum is {found}, not \
-                        {expected}"
-                    )
-                }),
-                Err(error) => Some(format!("cannot be read: {error}")),
-            }
+            change(&path, expected)
         };
         if let Some(problem) = problem {
             return Err(RunError::CourseChanged { path, problem });
         }
     }
     Ok(())
+}
+
+/// Returns the checksum of the encoder at `path`; `None` if there is none.
+pub(super) fn encoder_checksum(path: &Path) -> io::Result<Option<String>> {
+    match checksum(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        checksum => checksum.map(Some),
+    }
+}
+
+/// Checks that the run starts from the encoder at `path`, and that it matches `expected`.
+pub(super) fn verify_encoder(
+    path: &Path,
+    expected: Option<&str>,
+    config: &Config,
+) -> Result<(), RunError> {
+    // A run created without a copy has no checksum.
+    let (Some(expected), Some(used)) = (expected, &config.vae.start_from) else {
+        return Ok(());
+    };
+    let problem = match used == path {
+        true => change(path, expected),
+        false => Some(format!(
+            "is not what vae.start_from names, which is {}",
+            used.display()
+        )),
+    };
+    problem.map_or(Ok(()), |problem| {
+        Err(RunError::EncoderChanged {
+            path: path.to_owned(),
+            problem,
+        })
+    })
+}
+
+/// Returns the difference between the file at `path` and the one whose checksum is `expected`.
+fn change(path: &Path, expected: &str) -> Option<String> {
+    match checksum(path) {
+        Ok(found) => (found != expected).then(|| {
+            format!(
+                "has changed since the run was started: its checksum is {found}, not {expected}"
+            )
+        }),
+        Err(error) => Some(format!("cannot be read: {error}")),
+    }
 }
 
 /// Returns the xxh3 in hexadecimal, because JSON numbers do not hold 64 bits everywhere.

@@ -1,0 +1,65 @@
+//! `skein-encoder`: trains an encoder before any run, or measures one.
+
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use skein_encoder::arguments::Arguments;
+use skein_encoder::measurement::Measurement;
+use skein_encoder::training::{Ending, Training};
+use skein_encoder::views::simulator_settings;
+use skein_protocol::config::Config;
+use skein_protocol::encoder_file::TrainedEncoder;
+use skein_run::allocation::keep_freed_memory;
+use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
+use skein_run::signals::is_ignored;
+use skein_run::{note, show};
+
+fn main() -> ExitCode {
+    keep_freed_memory();
+    match run(&Arguments::parse()) {
+        Ok(status) => status,
+        Err(error) => {
+            note!("skein encoder: {}", with_causes(error.as_ref()));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> Result<ExitCode> {
+    let config = Config::load(&arguments.config, &arguments.overrides)?;
+    let settings =
+        simulator_settings(&config).with_context(|| arguments.config.display().to_string())?;
+    if let Some(file) = &arguments.measure {
+        let encoder = TrainedEncoder::load(file)?;
+        show!("{}", Measurement::of(&encoder, &config, &settings)?);
+        return Ok(ExitCode::SUCCESS);
+    }
+    let stop = stop_on_signals().context("cannot listen to signals")?;
+    let mut training = Training::begin(&config, &settings, arguments.files()?)?;
+    match training.train(&stop)? {
+        Ending::Completed => {
+            let (encoder, file) = training.finish()?;
+            show!("{}", Measurement::of(&encoder, &config, &settings)?);
+            show!("{}: SHA-256 {}", file.display(), encoder.sha256());
+            Ok(ExitCode::SUCCESS)
+        }
+        Ending::Interrupted(steps) => {
+            note!("skein encoder: stopped after step {steps}; the same command resumes");
+            Ok(ExitCode::from(EXIT_INTERRUPTED))
+        }
+    }
+}
+
+/// Returns a flag that SIGTERM and SIGINT set, unless they were ignored when this process started.
+fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    for number in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
+        if !is_ignored(number) {
+            signal_hook::flag::register(number, stop.clone())?;
+        }
+    }
+    Ok(stop)
+}
