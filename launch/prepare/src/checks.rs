@@ -80,7 +80,10 @@ pub fn check(
             .check_reach(corridor, start)
             .map_err(|source| PrepareError::OutOfReach {
                 config: in_file(),
-                course: "[simulator.generator]".to_owned(),
+                course: match ranges.layout {
+                    Some(_) => "[simulator.generator.layout], the longest course".to_owned(),
+                    None => "[simulator.generator]".to_owned(),
+                },
                 source,
             })?;
         if trains_on_generated {

@@ -230,6 +230,22 @@ fn an_impossible_run_is_refused_before_anything_is_created() {
             vec!["[simulator.generator]", "corridor.length_m = 100"],
         ),
         (
+            "[simulator.generator.layout]\nwalls = [1, 8]\nspacing_m = [6.0, 15.0]",
+            "courses.generated_share=0.5",
+            1,
+            vec![
+                "[simulator.generator.layout], the longest course",
+                "corridor.length_m = 130",
+                "max_steps to 257 or more",
+            ],
+        ),
+        (
+            "[simulator.generator.layout]\nwalls = [1, 4]",
+            "courses.generated_share=0.5",
+            1,
+            vec!["learning.levels = 5", "4 walls", "layout.walls"],
+        ),
+        (
             "[transport]\nmax_actors = 3",
             "",
             4,
