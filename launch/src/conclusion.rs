@@ -122,6 +122,7 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     [
         (run.config(), "the resolved configuration"),
         (run.courses(), "courses of the run"),
+        (run.encoder(), "the encoder that the run started from"),
         (run.episodes_csv(), "one row per training episode"),
         (run.evaluation_json(), "the evaluation above"),
         (

@@ -37,7 +37,13 @@ fn the_shipped_configurations_exist() {
         .collect();
     assert_eq!(
         names,
-        ["generalist.toml", "local.toml", "paper.toml", "smoke.toml"]
+        [
+            "encoder.toml",
+            "generalist.toml",
+            "local.toml",
+            "paper.toml",
+            "smoke.toml"
+        ]
     );
 }
 

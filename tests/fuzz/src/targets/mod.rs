@@ -66,7 +66,7 @@ impl Target {
 const USUAL: usize = 200;
 
 /// All targets.
-pub static TARGETS: [Target; 23] = [
+pub static TARGETS: [Target; 24] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -79,6 +79,7 @@ pub static TARGETS: [Target; 23] = [
     signals::SIGNALS,
     snapshots::FILE,
     snapshots::RECEIVED,
+    snapshots::ENCODER,
     checkpoints::FILES,
     replay::REPLAY,
     checkpoints::EPISODES_CSV,

@@ -1,5 +1,5 @@
-//! Snapshots, from a file and off the wire. A valid one is 3 MB of parameters; inputs change some
-//! of them, the header, and the length.
+//! Snapshots, from a file and off the wire, and encoders. A valid one is 3 MB of parameters; inputs
+//! change some of them, the header, and the length.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -7,6 +7,7 @@ use std::sync::LazyLock;
 
 use bytemuck::{bytes_of, cast_slice};
 use skein_protocol::config::Config;
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::ids::{PolicyVersion, RunId};
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
 
@@ -23,6 +24,15 @@ pub(super) const FILE: Target = Target {
     run: file,
 };
 
+pub(super) const ENCODER: Target = Target {
+    name: "encoder_file",
+    reads: "encoder files: the safetensors header and metadata, before valid parameters",
+    longest_bytes: FILE.longest_bytes,
+    weight: USUAL,
+    samples: || vec![SOUND.encoder_header.clone(), SOUND.header.clone()],
+    run: encoder,
+};
+
 pub(super) const RECEIVED: Target = Target {
     name: "snapshot_received",
     reads: "snapshots off the wire: header, then changes to a valid one's bytes",
@@ -34,13 +44,14 @@ pub(super) const RECEIVED: Target = Target {
 
 const RUN: RunId = RunId(1);
 
-/// The file of a small policy's snapshot, in two parts.
+/// The file of a small policy's snapshot, in two parts, and the header of its encoder's own file.
 struct ValidSnapshot {
     layout: SnapshotLayout,
     snapshot: Snapshot,
     /// Header with its length before it.
     header: Vec<u8>,
     values: Vec<u8>,
+    encoder_header: Vec<u8>,
 }
 
 static SOUND: LazyLock<ValidSnapshot> = LazyLock::new(|| {
@@ -55,11 +66,18 @@ static SOUND: LazyLock<ValidSnapshot> = LazyLock::new(|| {
     };
     let mut header = snapshot.to_file(&layout, &config);
     let values = header.split_off(header.len() - layout.values() * size_of::<f32>());
+    let encoder = TrainedEncoder {
+        values: snapshot.values[layout.encoder()].to_vec(),
+        latent: config.vae.latent,
+    };
+    let mut encoder_header = encoder.to_file(&config, 7);
+    encoder_header.truncate(encoder_header.len() - encoder.values.len() * size_of::<f32>());
     ValidSnapshot {
         layout,
         snapshot,
         header,
         values,
+        encoder_header,
     }
 });
 
@@ -75,17 +93,45 @@ thread_local! {
 /// is right if the rest has the same length.
 fn file(bytes: &[u8]) -> ReaderDecision {
     BUFFER.with_borrow_mut(|buffer| {
-        let start = FILE.longest_bytes - bytes.len();
-        buffer[start..FILE.longest_bytes].copy_from_slice(bytes);
-        // Only a header with the stated length is read at all.
-        if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
-            *length = (bytes.len() as u64 - 8).to_le_bytes();
-        }
+        let start = put_header(buffer, bytes);
         let sound = [&buffer[start..], bytes].map(|file| {
             match Snapshot::parse(file, Path::new("fuzzed.safetensors")) {
                 Ok((snapshot, config)) => {
                     check(&snapshot, &SnapshotLayout::of(&config));
                     Some(snapshot)
+                }
+                Err(error) => {
+                    assert!(error.to_string().contains("fuzzed.safetensors"), "{error}");
+                    None
+                }
+            }
+        });
+        ReaderDecision::of(sound.into_iter().flatten().next())
+    })
+}
+
+/// Puts a header before the values. Returns its place.
+fn put_header(buffer: &mut [u8], header: &[u8]) -> usize {
+    let start = FILE.longest_bytes - header.len();
+    buffer[start..FILE.longest_bytes].copy_from_slice(header);
+    // Only a header with the stated length is read at all.
+    if let Some(length) = buffer[start..FILE.longest_bytes].first_chunk_mut::<8>() {
+        *length = (header.len() as u64 - 8).to_le_bytes();
+    }
+    start
+}
+
+/// Parses an encoder's file as [`file`] does, and as the file of a snapshot with the same header.
+fn encoder(bytes: &[u8]) -> ReaderDecision {
+    BUFFER.with_borrow_mut(|buffer| {
+        let start = put_header(buffer, bytes);
+        let encoder = SOUND.layout.encoder().len() * size_of::<f32>();
+        let own = &buffer[start..FILE.longest_bytes + encoder];
+        let sound = [own, &buffer[start..], bytes].map(|file| {
+            match TrainedEncoder::parse(file, Path::new("fuzzed.safetensors")) {
+                Ok(encoder) => {
+                    assert!(encoder.values.iter().all(|value| value.is_finite()));
+                    Some(encoder)
                 }
                 Err(error) => {
                     assert!(error.to_string().contains("fuzzed.safetensors"), "{error}");
