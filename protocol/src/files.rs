@@ -93,7 +93,7 @@ mod tests {
         let error = read(&file, 3).unwrap_err().to_string();
         assert!(error.contains("4 bytes, more than the 3"), "{error}");
         for strange in [Path::new("/dev/zero"), folder.path()] {
-            let error = read_text(strange, TABLE_BYTES).unwrap_err().to_string();
+            let error = read_text(strange, SETTINGS_BYTES).unwrap_err().to_string();
             assert!(error.contains("not a regular file"), "{error}");
         }
         let missing = read(&folder.path().join("missing"), 4).unwrap_err();

@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn control_groups_below_both_versions_are_found() {
+    fn control_groups_of_both_versions_are_found() {
         let files = |groups: &str| -> Vec<_> {
             let groups = groups_below(Path::new("/m"), groups).into_iter();
             groups.map(|group| (group.limit, group.kills)).collect()
