@@ -182,7 +182,7 @@ mod tests {
         let report = EvaluationReport {
             policy_version: PolicyVersion(42),
             policy_sha256: "00".to_owned(),
-            courses: vec![CourseEvaluation::of("training", 5, &[])],
+            courses: vec![CourseEvaluation::of("training", &[])],
         };
         let mut stages = StageTimes::default();
         stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));

@@ -372,6 +372,7 @@ fn close(
     record.hit_wall = hit_wall.unwrap_or(0);
     EpisodeScore {
         walls_passed: report.walls_passed.into(),
+        walls: course.levels().into(),
         // As in `episodes.csv`. For a segment, its rewards only.
         episode_return: f64::from(episode_return as f32),
         outcome,

@@ -397,13 +397,13 @@ mod tests {
         };
         let score = EpisodeScore {
             walls_passed: 0,
+            walls: 5,
             episode_return: 0.0,
             outcome: Outcome::Collided,
             hit_wall: None,
         };
         EvaluatedEpisode {
             score,
-            walls: 5,
             positions_m: Vec::new(),
             records: (first..first + records).map(record).collect(),
         }

@@ -259,7 +259,7 @@ mod tests {
             policy_version: PolicyVersion(1),
             policy_sha256: String::new(),
             courses: ["training", "non_rectangular"]
-                .map(|name| CourseEvaluation::of(name, 3, episodes))
+                .map(|name| CourseEvaluation::of(name, episodes))
                 .to_vec(),
         }
     }
@@ -268,6 +268,7 @@ mod tests {
     fn no_table_exceeds_the_terminal_and_only_a_wide_one_has_all_in_a_row() {
         let score = EpisodeScore {
             walls_passed: 2,
+            walls: 3,
             episode_return: -12.345,
             outcome: Outcome::Collided,
             hit_wall: None,
@@ -311,6 +312,7 @@ mod tests {
     fn failures_stand_in_course_order_and_a_dot_is_none() {
         let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
+            walls: 3,
             episode_return: 0.0,
             outcome,
             hit_wall,

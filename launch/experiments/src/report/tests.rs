@@ -23,6 +23,7 @@ const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"complet
 fn entry_result(entry: &str, completed: usize) -> CourseEvaluation {
     let score = |number: usize| EpisodeScore {
         walls_passed: if number < completed { 2 } else { 0 },
+        walls: 2,
         episode_return: 0.0,
         outcome: match number < completed {
             true => Outcome::ReachedEnd,
@@ -31,7 +32,7 @@ fn entry_result(entry: &str, completed: usize) -> CourseEvaluation {
         hit_wall: None,
     };
     let episodes: Vec<_> = (0..4).map(score).collect();
-    CourseEvaluation::of(entry, 2, &episodes)
+    CourseEvaluation::of(entry, &episodes)
 }
 
 fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
