@@ -76,8 +76,8 @@ impl World {
         })
     }
 
-    /// Puts the body at rest at `position_m`, with `mass_factor` times its nominal mass. It is a new
-    /// body: an episode depends on its start and actions alone.
+    /// Puts a new body at rest at `position_m`, with `mass_factor` times the nominal mass: an
+    /// episode depends on its start and actions alone.
     pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
         let properties = self.nominal.scaled(mass_factor);
         self.body = Body::at_rest(&properties, position_m, self.dt_secs);

@@ -215,8 +215,8 @@ impl Course {
         Self::generate_from_level(seed, 1, ranges)
     }
 
-    /// Generates the course of a seed and a start level: it has a wall for that level, if the ranges
-    /// allow as many walls.
+    /// Generates the course of a seed and a start level. It has a wall for that level, if the
+    /// ranges allow as many walls.
     ///
     /// # Errors
     /// Like [`Course::generate`].

@@ -8,9 +8,10 @@ use crate::course::check::{LARGEST_M, NEAR_MIDDLE_M, SETTLING_M};
 use crate::course::{BODY_CLEARANCE_M, Corridor, MAX_WALLS, StartArea};
 use crate::text::exactly;
 
-/// Ranges for corridors: section `[simulator.generator.layout]`. Every key has a least and a largest
-/// value, drawn uniformly. Without the section, every course has the generator's `corridor`,
-/// `start`, `wall_x_m` and `wall_thickness_m`. The defaults here give that same corridor.
+/// Ranges for corridors: section `[simulator.generator.layout]`. Every key has a least and a
+/// largest value, drawn uniformly. Without the section, every course has the generator's
+/// `corridor`, `start`, `wall_x_m` and `wall_thickness_m`. The defaults here give that same
+/// corridor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LayoutRanges {
@@ -155,8 +156,8 @@ impl LayoutRanges {
         }
     }
 
-    /// Returns the ranges of the corridor whose openings are the hardest to place: the narrowest one
-    /// with the most walls, closest together.
+    /// Returns the ranges of the corridor whose openings are the hardest to place: the narrowest
+    /// one with the most walls, closest together.
     pub(super) fn hardest(&self) -> Self {
         let [least, most] = [0, 1].map(|end| move |range: [f32; 2]| [range[end]; 2]);
         Self {
