@@ -39,6 +39,7 @@ fn the_shipped_configurations_exist() {
         names,
         [
             "encoder.toml",
+            "generalist-sac.toml",
             "generalist.toml",
             "local.toml",
             "paper.toml",
