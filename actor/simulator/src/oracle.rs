@@ -38,6 +38,11 @@ impl Steering {
     }
 }
 
+/// Distance that the tail has flown behind a wall before the oracle leaves its opening, m. A policy
+/// that imitates the oracle knows only roughly where its tail is: too early is a crash, too late
+/// costs a third of a second.
+pub(crate) const HOLD_M: f32 = 0.3;
+
 /// Returns the action `[v_y, v_z]` for a drone that has left `walls_behind` walls, m/s in the
 /// heading frame, each in [-1, 1].
 ///

@@ -218,7 +218,9 @@ impl Simulator {
     /// each in [-1, 1].
     #[must_use]
     pub fn oracle_action(&self) -> [f32; 2] {
-        oracle::action(&self.course, self.walls_left(), &self.state())
+        let hold_m = self.world.tail_x_m() - oracle::HOLD_M;
+        let walls_behind = self.course.walls_before(hold_m);
+        oracle::action(&self.course, walls_behind, &self.state())
     }
 
     /// Returns the ground truth of the current moment, which the camera does not show.
