@@ -94,12 +94,15 @@ fn a_pipe_or_a_device_in_the_place_of_an_argument_is_refused() {
     ];
     for file in ["pipe", "/dev/zero"] {
         let course = format!("courses.training={file}");
+        let encoder = format!("vae.start_from={file}");
+        let frozen = ["--set", "vae.train_steps=0", "--set", &encoder];
         for arguments in [
             vec!["evaluate", "--snapshot", file],
             vec!["evaluate", "--snapshot", snapshot, "--course", file],
             vec!["evaluate", "--snapshot", snapshot, "--suite", file],
             [&new_run[..], &["--config", file]].concat(),
             [&new_run[..], &["--set", &course]].concat(),
+            [&new_run[..], &frozen].concat(),
         ] {
             work.assert_refused(&arguments, file);
         }

@@ -38,8 +38,8 @@ fn the_shipped_configurations_exist() {
     assert_eq!(
         names,
         [
+            "distill.toml",
             "encoder.toml",
-            "generalist-sac.toml",
             "generalist.toml",
             "local.toml",
             "paper.toml",
