@@ -10,7 +10,7 @@ use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::{OutOfReach, SimulatorError};
 
-use super::room::{FoldersTooSmall, SharedMemoryTooSmall};
+use super::room::{FilesTooSmall, FoldersTooSmall, SharedMemoryTooSmall};
 
 /// Reason why a run cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -142,6 +142,9 @@ pub enum PrepareError {
     /// The disk has no room for the transport's small files.
     #[error(transparent)]
     Folders(#[from] FoldersTooSmall),
+    /// The limit on the size of a file is too low.
+    #[error(transparent)]
+    FileSize(#[from] FilesTooSmall),
     /// The run's directory is not empty.
     #[error(
         "{} is not empty: choose another --run-dir, \
