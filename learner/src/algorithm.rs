@@ -1,9 +1,10 @@
 //! The interface between a learning algorithm and the rest of the learner.
 //!
 //! An algorithm receives minibatches and noise, and yields a policy. Replay, transport and actors
-//! know nothing of it. To add one: write a module beside [`crate::sac`], [`crate::td3`] and [`crate::distill`] that
-//! implements [`Algorithm`], add its settings section to `skein_protocol::config` and its name to
-//! `AlgorithmName`. The compiler then points at every other place that must know it.
+//! know nothing of it. To add one: write a module beside [`crate::sac`], [`crate::td3`] and
+//! [`crate::distill`] that implements [`Algorithm`], add its settings section to
+//! `skein_protocol::config` and its name to `AlgorithmName`. The compiler then points at every
+//! other place that must know it.
 
 use std::fmt;
 

@@ -2,8 +2,8 @@
 //!
 //! Training episodes have exploration noise and start at all levels, so their average only shows
 //! when a closer look pays. Confirmation episodes are flown like the final evaluation: without
-//! noise, from the start of level 1. They are the same for all candidates, so the best one's results
-//! tell early that a candidate will not replace it.
+//! noise, from the start of level 1. They are the same for all candidates, so the best one's
+//! results tell early that a candidate will not replace it.
 
 use skein_protocol::config::EvaluationSection;
 

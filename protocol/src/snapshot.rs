@@ -383,8 +383,8 @@ pub(crate) const CHECKSUM_KEY: &str = "skein.checksum";
 const VERSION_KEY: &str = "skein.policy_version";
 pub(crate) const CONFIG_KEY: &str = "skein.config";
 
-/// Returns the xxh3 of a parameter file's content in hexadecimal. Nothing else detects a flipped bit
-/// that leaves finite numbers.
+/// Returns the xxh3 of a parameter file's content in hexadecimal. Nothing else detects a flipped
+/// bit that leaves finite numbers.
 pub(crate) fn checksum(texts: &[&str], values: &[f32]) -> String {
     let mut hasher = Xxh3::new();
     for text in texts {

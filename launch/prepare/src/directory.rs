@@ -86,8 +86,8 @@ impl NewDirectory {
     }
 }
 
-/// Copies course files and encoder into the run's directory and makes the configuration refer to the
-/// copies, so that the run stays reproducible when the originals change.
+/// Copies course files and encoder into the run's directory and makes the configuration refer to
+/// the copies, so that the run stays reproducible when the originals change.
 pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let run = RunDirectory::new(root);
     if let Some(encoder) = &mut config.vae.start_from {

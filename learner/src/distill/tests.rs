@@ -1,4 +1,4 @@
-//! That the update learns the teacher's actions, keeps the exploration, and is exact.
+//! Tests: the update learns the teacher's actions, keeps the exploration, and is exact.
 
 use skein_protocol::LOG_STD;
 

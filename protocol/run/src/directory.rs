@@ -182,8 +182,8 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Reads identity and configuration of an existing run, and checks that its course files and its
-    /// encoder are those it was started with.
+    /// Reads identity and configuration of an existing run, and checks that its course files and
+    /// its encoder are those it was started with.
     ///
     /// # Errors
     /// [`RunError`] names the file and the problem.

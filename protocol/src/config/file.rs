@@ -326,8 +326,8 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
 /// Keys that name files.
 pub const FILE_KEYS: [&str; 3] = ["courses.training", "courses.evaluation", "vae.start_from"];
 
-/// Makes paths absolute: paths on the command line are relative to the working directory, not to the
-/// configuration file. Other values are left for validation to refuse.
+/// Makes paths absolute: paths on the command line are relative to the working directory, not to
+/// the configuration file. Other values are left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {

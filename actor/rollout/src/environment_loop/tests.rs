@@ -211,8 +211,10 @@ fn the_teacher_is_recorded_in_each_step_and_flies_its_share() {
     };
     let flown_by_teacher = |records: &[Box<TransitionRecord>]| {
         let steps = &records[..records.len() - 1];
-        let same = |record: &&Box<TransitionRecord>| record.action == record.teacher_action;
-        (steps.iter().filter(same).count(), steps.len())
+        let by_teacher = steps
+            .iter()
+            .filter(|record| record.action == record.teacher_action);
+        (by_teacher.count(), steps.len())
     };
     let (_, alone) = fly(None);
     let (_, watched) = fly(Some(0.0));
