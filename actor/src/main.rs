@@ -18,7 +18,7 @@ use skein_run::allocation::return_large_blocks;
 use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::note;
-use skein_run::signals::is_ignored;
+use skein_run::signals::{is_ignored, survive_file_size_limit};
 use skein_run::{Presence, RunDirectory};
 use skein_simulator::camera::InstructionSet;
 use tracing::{error, info};
@@ -42,6 +42,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     return_large_blocks();
     match run(&Arguments::parse()) {
         Ok(ExitReason::Stopped | ExitReason::Signalled) => ExitCode::SUCCESS,

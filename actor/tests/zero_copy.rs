@@ -107,6 +107,7 @@ fn the_learner_reads_images_where_the_camera_wrote_them() {
         start_level: 1,
         exploration: Exploration::Uniform,
         seed: 5,
+        teacher_share: None,
         segment: None,
     };
     let simulators = Simulators::new(Arc::new(Courses::of_run(&config).unwrap()));

@@ -74,7 +74,6 @@ pub(crate) struct RunArguments {
     #[arg(
         long,
         value_name = "N",
-        requires = "resume",
         value_parser = clap::value_parser!(u64).range(1..)
     )]
     pub(crate) episodes: Option<u64>,
@@ -219,7 +218,9 @@ impl RunArguments {
     /// Ends the process with the reason if the arguments contradict each other.
     pub(crate) fn task(&self) -> Task<'_> {
         match (&self.resume, &self.config, &self.run_dir) {
-            (None, Some(config), Some(run_dir)) => Task::New { config, run_dir },
+            (None, Some(config), Some(run_dir)) if self.episodes.is_none() => {
+                Task::New { config, run_dir }
+            }
             (Some(directory), None, None) if self.overrides.is_empty() => Task::Resume {
                 directory,
                 episodes: self.episodes,
@@ -231,8 +232,14 @@ impl RunArguments {
         }
     }
 
-    /// Returns what contradicts --resume, and what to do.
+    /// Returns what contradicts --resume, or lacks it, and what to do.
     fn conflict(&self) -> String {
+        if let (None, Some(episodes)) = (&self.resume, self.episodes) {
+            return format!(
+                "--episodes lengthens a run and needs --resume DIR; for a new run, give \
+                 --set run.episodes={episodes}"
+            );
+        }
         let given = [
             (self.config.is_some(), "--config"),
             (self.run_dir.is_some(), "--run-dir"),

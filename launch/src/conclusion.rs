@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::de::DeserializeOwned;
 use skein_protocol::config::EvaluationSection;
 use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::files::{self, REPORT_BYTES};
 use skein_protocol::stages::StageTimes;
 use skein_protocol::summary::{RunEnding, RunSummary, Trained};
 use skein_run::RunDirectory;
@@ -60,7 +61,7 @@ fn push(text: &mut String, line: &str) {
 }
 
 fn read<T: DeserializeOwned>(path: &Path) -> Option<T> {
-    serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    serde_json::from_slice(&files::read(path, REPORT_BYTES).ok()?).ok()
 }
 
 fn trained_sentence(trained: &Trained) -> String {
@@ -181,7 +182,7 @@ mod tests {
         let report = EvaluationReport {
             policy_version: PolicyVersion(42),
             policy_sha256: "00".to_owned(),
-            courses: vec![CourseEvaluation::of("training", 5, &[])],
+            courses: vec![CourseEvaluation::of("training", &[])],
         };
         let mut stages = StageTimes::default();
         stages.add(Stage::Encoder, 2000, Duration::from_millis(1500));

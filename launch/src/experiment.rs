@@ -100,8 +100,11 @@ impl ExperimentArguments {
                 status = ExitCode::FAILURE;
             }
         }
-        self.report_results(&experiment, &root, seeds, publication.as_ref())?;
-        Ok(status)
+        let are_all_read = self.report_results(&experiment, &root, seeds, publication.as_ref())?;
+        Ok(match are_all_read {
+            true => status,
+            false => ExitCode::FAILURE,
+        })
     }
 
     fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<SessionOutcome> {
@@ -137,21 +140,30 @@ impl ExperimentArguments {
         session
     }
 
-    /// Writes and prints the report, and publishes it if requested.
+    /// Writes and prints the report, and publishes it if requested. Returns `false` if the report
+    /// lacks a complete run, whose files cannot be read.
     fn report_results(
         &self,
         experiment: &Experiment,
         root: &Path,
         seeds: u64,
         publication: Option<&Publication>,
-    ) -> Result<()> {
+    ) -> Result<bool> {
         // Read the runs again: if the experiment's file changed meanwhile, they may belong to two
         // experiments.
         let plan = ExperimentPlan::new(experiment, root, seeds)?;
+        let (results, unreadable) = results::read(&plan);
+        for error in &unreadable {
+            note!(
+                "skein: a run is left out of the report: {}",
+                with_causes(error)
+            );
+        }
+        let are_all_read = unreadable.is_empty();
         let findings = Findings {
             experiment,
             plan: &plan,
-            results: &results::read(&plan)?,
+            results: &results,
             command: self.command(experiment, Options::OfTheResult),
         };
         let report = findings.write()?;
@@ -162,14 +174,14 @@ impl ExperimentArguments {
             note!("skein: a plot could not be drawn: {}", with_causes(failure));
         }
         let Some(publication) = publication else {
-            return Ok(());
+            return Ok(are_all_read);
         };
         if !report.failures.is_empty() {
             bail!("not published: a picture is missing; see above");
         }
         if !findings.is_whole() {
             bail!(
-                "not published: only {} of {} runs are complete",
+                "not published: only {} of {} runs are complete and can be read",
                 findings.results.len(),
                 plan.runs.len()
             );
@@ -177,7 +189,7 @@ impl ExperimentArguments {
         for file in publication.publish(&findings, &report)? {
             note!("skein: published {}", file.display());
         }
-        Ok(())
+        Ok(are_all_read)
     }
 
     /// Returns the command that repeats this one.

@@ -30,6 +30,7 @@ use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use skein_run::logging::environment_faults;
+use skein_run::signals::survive_file_size_limit;
 use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 use skein_run::{note, show};
@@ -48,6 +49,7 @@ const PATIENCE: Duration = Duration::from_secs(10);
 struct Unfinished;
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),
@@ -345,6 +347,9 @@ fn draw(run: &RunDirectory, config: &Config) -> Plots {
     let window = config.evaluation.window_episodes as usize;
     let drawn = skein_reports::draw_all(run, &courses, window, ideal);
     failures.extend(drawn.failures.iter().map(|error| with_causes(error)));
+    for torn in &drawn.torn {
+        note!("skein: note: {torn}");
+    }
     Plots {
         pictures: drawn.pictures,
         failures,

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use skein_run::terminal::quoted;
 use skein_run::{LockError, PathError, RunDirectory, RunError, SupervisorLock};
 
-use skein_prepare::room::{check_folders, check_shared_memory};
+use skein_prepare::room::{check_file_size, check_folders, check_shared_memory};
 use skein_prepare::{PrepareError, Prepared, check};
 
 /// Time between two checks whether an earlier learner has ended.
@@ -96,7 +96,7 @@ pub fn resume(
             .canonicalize()
             .map_err(|_| not_a_run(Path::new("run.json")))?,
     );
-    if !run.identity().is_file() {
+    if !run.identity().exists() {
         return Err(not_a_run(Path::new("run.json")));
     }
     let (identity, config) = match episodes {
@@ -134,6 +134,7 @@ pub fn resume(
     run.make_folders()?;
     check(&run.config(), &config, actors)?;
     check_shared_memory(&config, actors).map_err(PrepareError::from)?;
+    check_file_size(&config, actors).map_err(PrepareError::from)?;
     check_folders().map_err(PrepareError::from)?;
     Ok((
         Prepared {

@@ -78,6 +78,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
             })
             .collect(),
         actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
+        teacher_actions: vec![[0.0; ACTION]; STEPS],
         rewards: (0..STEPS).map(|_| draw()).collect(),
         reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),

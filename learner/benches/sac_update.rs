@@ -34,6 +34,7 @@ fn main() {
         next_states: &next_observations,
         terminated: &vec![0.0; rows],
         images: None,
+        teacher_actions: None,
     };
     for width in [64, 128, WIDTH, 512, 1024] {
         update(&mut criterion, Engine::Native, width, columns);

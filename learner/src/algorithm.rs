@@ -1,9 +1,10 @@
 //! The interface between a learning algorithm and the rest of the learner.
 //!
 //! An algorithm receives minibatches and noise, and yields a policy. Replay, transport and actors
-//! know nothing of it. To add one: write a module beside [`crate::sac`] and [`crate::td3`] that
-//! implements [`Algorithm`], add its settings section to `skein_protocol::config` and its name to
-//! `AlgorithmName`. The compiler then points at every other place that must know it.
+//! know nothing of it. To add one: write a module beside [`crate::sac`], [`crate::td3`] and
+//! [`crate::distill`] that implements [`Algorithm`], add its settings section to
+//! `skein_protocol::config` and its name to `AlgorithmName`. The compiler then points at every
+//! other place that must know it.
 
 use std::fmt;
 
@@ -119,6 +120,9 @@ pub struct Columns<'a> {
     /// encoder is trained end to end: its codes change with every update, so the replay cannot
     /// store them.
     pub images: Option<[&'a [u8]; 2]>,
+    /// The teacher's actions for the observations before the action, `[rows, 2]`. Present only
+    /// where there is a teacher.
+    pub teacher_actions: Option<&'a [f32]>,
 }
 
 impl Columns<'_> {
@@ -136,7 +140,10 @@ impl Columns<'_> {
             (self.states, inputs.critic),
             (self.next_states, inputs.critic),
             (self.terminated, 1),
-        ] {
+        ]
+        .into_iter()
+        .chain(self.teacher_actions.map(|actions| (actions, ACTION)))
+        {
             let len = column.len();
             assert_eq!(
                 len,

@@ -20,6 +20,8 @@ pub(crate) struct TensorBatch {
     /// Depth images before and after the action, `[rows, 1, 72, 128]` each, in [0, 1]. Present only
     /// where the encoder is trained end to end.
     pub(crate) images: Option<[Tensor; 2]>,
+    /// The teacher's actions. Present only where there is a teacher.
+    pub(crate) teacher_actions: Option<Tensor>,
 }
 
 impl TensorBatch {
@@ -43,6 +45,9 @@ impl TensorBatch {
             next_states: column(columns.next_states, &[rows, state]),
             terminated: column(columns.terminated, &[rows]),
             images: columns.images.map(|images| images.map(seen)),
+            teacher_actions: columns
+                .teacher_actions
+                .map(|actions| column(actions, &[rows, ACTION as i64])),
         }
     }
 

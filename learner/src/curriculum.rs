@@ -5,10 +5,12 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::ACTION;
 use skein_protocol::config::{Config, ConfirmOn};
-use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion, RunId};
+use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
+
+use crate::checkpoint::EpochOrder;
 
 /// Distance between the first episode numbers of two evaluations, so that no number occurs twice.
 const EVALUATION_STRIDE: u64 = 1 << 24;
@@ -21,27 +23,27 @@ pub(crate) fn epochs(config: &Config) -> u64 {
         .div_ceil(config.learning.episodes_per_epoch)
 }
 
-/// Tickets of `epoch`, in episode order. With episodes flown in segments, an epoch is one episode,
-/// and `flown` holds the actions of its segments so far, from the reset on.
+/// Tickets of the epoch that `order` asks for, in episode order. With episodes flown in segments,
+/// an epoch is one episode, and `flown` holds the actions of its segments so far, from the reset
+/// on.
 pub(crate) fn training(
     config: &Config,
     run: RunId,
-    epoch: Epoch,
-    version: PolicyVersion,
-    exploration: Exploration,
+    order: &EpochOrder,
     flown: &[[f32; ACTION]],
 ) -> Vec<Ticket> {
-    let first = epoch.0 * config.learning.episodes_per_epoch;
+    let first = order.epoch * config.learning.episodes_per_epoch;
     let end = (first + config.learning.episodes_per_epoch).min(config.run.episodes);
     let ticket = |episode| Ticket {
         run,
         episode: EpisodeId(episode),
         attempt: Attempt(0),
-        policy_version: version,
+        policy_version: PolicyVersion(order.policy_version),
         course: training_course(config, episode),
         start_level: start_level(config, episode),
-        exploration,
+        exploration: order.exploration,
         seed: derive(config.run.seed, Purpose::Episode, episode),
+        teacher_share: order.teacher_share,
         segment: config.learning.in_segments().then(|| Segment {
             steps: config.learning.segment_steps as u32,
             prior_actions: flown.into(),
@@ -72,6 +74,7 @@ pub(crate) fn evaluation(
         start_level: 1,
         exploration: Exploration::Mode,
         seed: derive(config.run.seed, Purpose::EvaluationEpisode, episode),
+        teacher_share: None,
         segment: None,
     };
     let flown = courses.flat_map(|course| (0..episodes).map(move |episode| (course, episode)));
@@ -125,18 +128,19 @@ mod tests {
     use std::collections::HashSet;
 
     use super::*;
+    use crate::episodes::assembly::KeptData;
 
     fn tickets(config: &Config) -> Vec<Ticket> {
         (0..epochs(config))
             .flat_map(|epoch| {
-                training(
-                    config,
-                    RunId(1),
-                    Epoch(epoch),
-                    PolicyVersion(epoch),
-                    Exploration::Sample,
-                    &[],
-                )
+                let order = EpochOrder {
+                    epoch,
+                    policy_version: epoch,
+                    exploration: Exploration::Sample,
+                    teacher_share: None,
+                    keep: KeptData::Latents,
+                };
+                training(config, RunId(1), &order, &[])
             })
             .collect()
     }

@@ -36,6 +36,7 @@ const TRUTH_SCALE: [f32; GROUND_TRUTH] = [
     1.0,                // mass
     1.0,                // latency
     3.0, 3.0, 3.0,      // gust
+    0.25, 0.25,         // half the corridor's width and height
 ];
 
 /// A whole episode of T steps, or T consecutive steps of one.
@@ -59,6 +60,8 @@ pub struct CommittedEpisode {
     pub observations: Vec<StepObservation>,
     /// Lateral and vertical velocity commands, each in [-1, 1]; `[T]`.
     pub actions: Vec<[f32; ACTION]>,
+    /// The teacher's actions for the same observations; zero where none was asked. `[T]`.
+    pub teacher_actions: Vec<[f32; ACTION]>,
     /// Rewards, `[T]`.
     pub rewards: Vec<f32>,
     /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
@@ -133,6 +136,7 @@ impl CommittedEpisode {
             depth: None,
             observations: self.observations.clone(),
             actions: self.actions.clone(),
+            teacher_actions: self.teacher_actions.clone(),
             rewards: self.rewards.clone(),
             reward_terms: self.reward_terms.clone(),
             level_up: self.level_up.clone(),
@@ -146,6 +150,8 @@ impl CommittedEpisode {
         self.observations.pop();
         self.observations.extend_from_slice(&segment.observations);
         self.actions.extend_from_slice(&segment.actions);
+        self.teacher_actions
+            .extend_from_slice(&segment.teacher_actions);
         self.rewards.extend_from_slice(&segment.rewards);
         self.reward_terms.extend_from_slice(&segment.reward_terms);
         self.level_up.extend_from_slice(&segment.level_up);
@@ -207,6 +213,7 @@ impl CommittedEpisode {
             .map_or((steps + 1) * IMAGE_PIXELS, Vec::len);
         for (what, found, expected) in [
             ("actions", steps, steps.max(1)),
+            ("teacher's actions", self.teacher_actions.len(), steps),
             ("observations", self.observations.len(), steps + 1),
             ("rewards", self.rewards.len(), steps),
             ("reward terms", self.reward_terms.len(), steps),
@@ -257,6 +264,9 @@ pub(crate) mod samples {
             actions: (0..steps)
                 .map(|step| [at(step) / 1e6, -at(step) / 1e6])
                 .collect(),
+            teacher_actions: (0..steps)
+                .map(|step| [at(step) / 2e6, -at(step) / 3e6])
+                .collect(),
             rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
             reward_terms: vec![[0.0; REWARD_TERMS]; steps],
             level_up: vec![false; steps],
@@ -302,8 +312,11 @@ mod tests {
         let sound = samples::with_images(samples::episode(3, 5, Outcome::Collided));
         assert_eq!(sound.check(), Ok(()));
         type Damage = fn(&mut CommittedEpisode);
-        let damage: [(&str, Damage); 6] = [
+        let damage: [(&str, Damage); 7] = [
             ("actions", |episode| episode.actions.clear()),
+            ("teacher's actions", |episode| {
+                episode.teacher_actions.clear();
+            }),
             ("observations", |episode| episode.observations.truncate(5)),
             ("rewards", |episode| episode.rewards.push(0.0)),
             ("reward terms", |episode| episode.reward_terms.truncate(4)),
@@ -359,10 +372,11 @@ mod tests {
         let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
         assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
-        assert_eq!(state[16..19], seen.velocity_mps);
-        assert_eq!(state[21..], episode.actions[3]);
+        assert_eq!(state[GROUND_TRUTH..GROUND_TRUTH + 3], seen.velocity_mps);
+        let before = CRITIC_STATE - ACTION;
+        assert_eq!(state[before..], episode.actions[3]);
         episode.write_critic_state(0, &mut state);
-        assert_eq!(state[21..], [0.0, 0.0]);
+        assert_eq!(state[before..], [0.0, 0.0]);
     }
 
     #[test]

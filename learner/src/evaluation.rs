@@ -79,10 +79,7 @@ pub(crate) fn write_report(
         .zip(flown.chunks(config.evaluation.episodes as usize))
     {
         let scores: Vec<EpisodeScore> = episodes.iter().map(score).collect();
-        let walls = episodes
-            .first()
-            .map_or(0, |episode| episode.course_walls.into());
-        courses.push(CourseEvaluation::of(name, walls, &scores));
+        courses.push(CourseEvaluation::of(name, &scores));
         for (number, episode) in episodes.iter().take(TRAJECTORIES).enumerate() {
             rows = rows.and_then(|()| write_trajectory(&mut trajectories, name, number, episode));
         }
@@ -108,6 +105,7 @@ pub(crate) fn write_report(
 fn score(episode: &CommittedEpisode) -> EpisodeScore {
     EpisodeScore {
         walls_passed: episode.walls_passed.into(),
+        walls: episode.course_walls.into(),
         episode_return: episode.total_reward().into(),
         outcome: episode.ending(),
         hit_wall: episode.hit_wall,

@@ -1,9 +1,10 @@
 //! `incarnations.csv`: when the learner of a run was started, and from which episode it resumed.
 
+use std::io;
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
-use std::{fs, io};
 
+use skein_protocol::files::{self, REPORT_BYTES};
 use skein_run::durable;
 
 const HEADER: &str = "incarnation,unix_secs,episodes\n";
@@ -15,7 +16,7 @@ const HEADER: &str = "incarnation,unix_secs,episodes\n";
 /// # Errors
 /// Errors of the file system.
 pub(crate) fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
-    let mut text = match fs::read_to_string(path) {
+    let mut text = match files::read_text(path, REPORT_BYTES) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => HEADER.to_owned(),
         Err(error) if error.kind() == io::ErrorKind::InvalidData => {
             tracing::warn!(
@@ -42,6 +43,8 @@ pub(crate) fn begin_incarnation(path: &Path, episodes: u64) -> io::Result<u64> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -12,7 +12,7 @@ use skein_run::allocation::keep_freed_memory;
 use skein_run::failure::{EXIT_RESTART, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::note;
-use skein_run::signals::is_ignored;
+use skein_run::signals::{is_ignored, survive_file_size_limit};
 use skein_run::{LearnerLock, RunDirectory};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
@@ -31,6 +31,7 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     keep_freed_memory();
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,

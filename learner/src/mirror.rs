@@ -20,10 +20,13 @@ impl CommittedEpisode {
     pub fn mirrored(&self) -> Self {
         let mut mirrored = self.without_images();
         mirrored.action_before = turn(self.action_before);
-        mirrored
+        for action in mirrored
             .actions
             .iter_mut()
-            .for_each(|action| *action = turn(*action));
+            .chain(&mut mirrored.teacher_actions)
+        {
+            *action = turn(*action);
+        }
         mirrored.observations.iter_mut().for_each(mirror);
         mirrored.depth = self.depth.clone();
         for row in mirrored

@@ -22,6 +22,7 @@ use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::average::PolicyAverage;
 use crate::checkpoint::TrainingProgress;
 use crate::device::{self, DeviceError};
+use crate::distill::Distill;
 use crate::episode::CommittedEpisode;
 use crate::episodes::assembly::KeptData;
 use crate::error::UpdateError;
@@ -122,14 +123,18 @@ pub(crate) struct Trainer {
 /// engine always runs on the CPU.
 pub(crate) fn new_algorithm(config: &Config, device: Device) -> Box<dyn Algorithm> {
     let (inputs, seed, engine) = (Inputs::of(config), config.run.seed, config.policy_engine());
+    let (sac, teacher) = (&config.sac, &config.teacher);
     match (config.learning.algorithm, engine) {
         (AlgorithmName::Sac, Engine::Native) => {
-            Box::new(NativeSac::new(&config.sac, inputs, seed, Isa::best()))
+            Box::new(NativeSac::new(sac, inputs, seed, Isa::best()).with_teacher(teacher))
         }
         (AlgorithmName::Sac, Engine::Libtorch) => {
-            Box::new(TorchSac::new(&config.sac, inputs, seed, device))
+            Box::new(TorchSac::new(sac, inputs, seed, device).with_teacher(teacher))
         }
         (AlgorithmName::Td3, _) => Box::new(Td3::new(&config.td3, inputs, seed, device)),
+        (AlgorithmName::Distill, _) => {
+            Box::new(Distill::new(&config.distill, inputs, seed, Isa::best()))
+        }
     }
 }
 
@@ -246,6 +251,14 @@ impl Trainer {
         } else {
             Exploration::Sample
         }
+    }
+
+    /// Share of the steps of the next episodes that the teacher flies; `None` without a teacher.
+    pub(crate) fn teacher_share(&self) -> Option<f32> {
+        let teacher = &self.config.teacher;
+        teacher
+            .is_configured()
+            .then(|| teacher.flown_share_after(self.steps) as f32)
     }
 
     /// Data to keep of the next episodes to be ordered.
@@ -498,6 +511,8 @@ fn columns(minibatch: &Minibatch) -> Columns<'_> {
         terminated: &minibatch.terminated,
         images: (!minibatch.images.is_empty())
             .then_some([&minibatch.images, &minibatch.next_images]),
+        teacher_actions: (!minibatch.teacher_actions.is_empty())
+            .then_some(&minibatch.teacher_actions),
     }
 }
 

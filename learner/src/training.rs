@@ -218,6 +218,7 @@ impl Training<'_> {
             epoch,
             policy_version: self.progress.version().0,
             exploration: self.trainer.exploration(),
+            teacher_share: self.trainer.teacher_share(),
             keep: self.trainer.keep(),
         }
     }
@@ -228,14 +229,7 @@ impl Training<'_> {
             .open_episode
             .as_ref()
             .map_or(&[][..], |episode| &episode.actions);
-        let tickets = curriculum::training(
-            self.config,
-            self.identity.run,
-            Epoch(order.epoch),
-            PolicyVersion(order.policy_version),
-            order.exploration,
-            flown,
-        );
+        let tickets = curriculum::training(self.config, self.identity.run, &order, flown);
         let batch = self.receiver.fly(Epoch(order.epoch), order.keep, tickets)?;
         let episodes = Vec::with_capacity(batch.remaining());
         self.in_flight.push_back(OrderInFlight {

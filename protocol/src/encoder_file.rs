@@ -3,12 +3,12 @@
 //! The file is safetensors, as a snapshot is, with the encoder's tensors alone.
 
 use std::collections::HashMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::config::Config;
+use crate::files::{self, TENSOR_BYTES};
 use crate::snapshot::{
     CHECKSUM_KEY, CONFIG_KEY, FORMAT_KEY, ParameterFile, Snapshot, SnapshotError, SnapshotLayout,
     checksum, write_tensors,
@@ -82,7 +82,7 @@ impl TrainedEncoder {
     /// # Errors
     /// [`SnapshotError`] names the file and the problem.
     pub fn load(path: &Path) -> Result<Self, SnapshotError> {
-        let bytes = fs::read(path).map_err(|source| SnapshotError::Io {
+        let bytes = files::read(path, TENSOR_BYTES).map_err(|source| SnapshotError::Io {
             path: path.to_owned(),
             source,
         })?;
@@ -152,6 +152,8 @@ impl TrainedEncoder {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::ids::PolicyVersion;
 

@@ -23,7 +23,8 @@ pub struct CourseEvaluation {
     pub course: String,
     /// Episodes flown.
     pub episodes: u64,
-    /// R = (t_1 + … + t_n) / (n · episodes): mean rate of walls passed (paper, section 4.4).
+    /// Walls passed of all walls. With n walls, it is the paper's mean rate of walls passed,
+    /// R = (t_1 + … + t_n) / (n · episodes) (section 4.4).
     pub r: f64,
     /// Share of episodes that reached the end wall.
     pub completed: f64,
@@ -38,7 +39,7 @@ pub struct CourseEvaluation {
     /// Episodes cut off by the step limit.
     pub timed_out: u64,
     /// Failures by place and cause: an entry for each wall in course order, and one for the section
-    /// from the last wall to the end wall. They sum to `collided` plus `timed_out`.
+    /// from a course's last wall to its end wall. They sum to `collided` plus `timed_out`.
     pub failures: Vec<WallFailures>,
 }
 
@@ -59,6 +60,8 @@ pub struct WallFailures {
 pub struct EpisodeScore {
     /// Walls passed, from the start of level 1.
     pub walls_passed: u32,
+    /// Walls of the course.
+    pub walls: u32,
     /// Sum of rewards.
     pub episode_return: f64,
     /// Outcome.
@@ -69,8 +72,10 @@ pub struct EpisodeScore {
 }
 
 impl CourseEvaluation {
-    /// Evaluates `episodes` of a course of `walls` walls.
-    pub fn of(course: &str, walls: usize, episodes: &[EpisodeScore]) -> Self {
+    /// Evaluates `episodes` of a course, or of courses that differ in their number of walls.
+    pub fn of(course: &str, episodes: &[EpisodeScore]) -> Self {
+        let walls = episodes.iter().map(|episode| episode.walls as usize);
+        let (walls, all) = (walls.clone().max().unwrap_or(0), walls.sum());
         let count = |holds: &dyn Fn(&EpisodeScore) -> bool| {
             episodes.iter().filter(|episode| holds(episode)).count() as u64
         };
@@ -89,7 +94,7 @@ impl CourseEvaluation {
         Self {
             course: course.to_owned(),
             episodes: episodes.len() as u64,
-            r: share(walls_passed.iter().sum(), walls * episodes.len()),
+            r: share(walls_passed.iter().sum(), all),
             completed: share(reached_end, episodes.len()),
             reached_end,
             walls_passed,
@@ -110,7 +115,10 @@ impl WallFailures {
     fn of(walls: usize, episodes: &[EpisodeScore]) -> Vec<Self> {
         let mut failures = vec![Self::default(); walls + 1];
         for episode in episodes {
-            let next = (episode.walls_passed as usize).min(walls);
+            let next = match episode.walls_passed < episode.walls {
+                true => episode.walls_passed as usize,
+                false => walls,
+            };
             match (episode.outcome, episode.hit_wall) {
                 (Outcome::ReachedEnd, _) => {}
                 (Outcome::TimedOut, _) => failures[next].timed_out += 1,
@@ -132,6 +140,7 @@ mod tests {
     fn r_counts_walls_and_completed_counts_courses() {
         let score = |walls_passed, outcome| EpisodeScore {
             walls_passed,
+            walls: 5,
             episode_return: 2.0,
             outcome,
             hit_wall: None,
@@ -142,7 +151,7 @@ mod tests {
             score(2, Outcome::Collided),
             score(0, Outcome::TimedOut),
         ];
-        let evaluation = CourseEvaluation::of("training", 5, &episodes);
+        let evaluation = CourseEvaluation::of("training", &episodes);
         assert_eq!(evaluation.walls_passed, [3, 3, 2, 2, 2]);
         assert_eq!(evaluation.r, 12.0 / 20.0);
         assert_eq!((evaluation.completed, evaluation.reached_end), (0.25, 1));
@@ -154,6 +163,7 @@ mod tests {
     fn every_failure_is_counted_once_where_it_happened() {
         let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
+            walls: 3,
             episode_return: 0.0,
             outcome,
             hit_wall,
@@ -161,13 +171,13 @@ mod tests {
         let episodes = [
             score(3, Outcome::ReachedEnd, None),
             score(1, Outcome::Collided, Some(2)),
-            // The drone's centre had passed the wall when its tail hit it.
+            // As older versions counted: the tail hit a wall that the centre had passed.
             score(2, Outcome::Collided, Some(2)),
             score(2, Outcome::Collided, None),
             score(0, Outcome::TimedOut, None),
             score(3, Outcome::Collided, None),
         ];
-        let evaluation = CourseEvaluation::of("training", 3, &episodes);
+        let evaluation = CourseEvaluation::of("training", &episodes);
         let failures = |hit_wall, hit_corridor, timed_out| WallFailures {
             hit_wall,
             hit_corridor,
@@ -185,7 +195,31 @@ mod tests {
     }
 
     #[test]
+    fn courses_of_different_length_count_by_their_own_walls() {
+        let score = |walls_passed, walls, outcome| EpisodeScore {
+            walls_passed,
+            walls,
+            episode_return: 0.0,
+            outcome,
+            hit_wall: None,
+        };
+        let evaluation = CourseEvaluation::of(
+            "mixed",
+            &[
+                score(1, 1, Outcome::ReachedEnd),
+                score(2, 4, Outcome::Collided),
+                score(1, 1, Outcome::TimedOut),
+            ],
+        );
+        assert_eq!(evaluation.r, 4.0 / 6.0);
+        assert_eq!(evaluation.walls_passed, [3, 1, 0, 0]);
+        let hit: Vec<_> = evaluation.failures.iter().map(|f| f.hit_corridor).collect();
+        assert_eq!(hit, [0, 0, 1, 0, 0]);
+        assert_eq!(evaluation.failures[4].timed_out, 1);
+    }
+
+    #[test]
     fn the_rate_of_zero_episodes_is_zero() {
-        assert_eq!(CourseEvaluation::of("training", 5, &[]).r, 0.0);
+        assert_eq!(CourseEvaluation::of("training", &[]).r, 0.0);
     }
 }

@@ -3,12 +3,14 @@
 //! The crate defines the work of an actor ([`ticket`], [`segment`]), one flown step on the wire
 //! ([`transition`]), a policy snapshot ([`snapshot`]), an actor's reports ([`status`], [`stages`]),
 //! the configuration of a run ([`config`]), and the formats of its files ([`evaluation`],
-//! [`summary`]) and progress reports ([`progress`]). It only defines them: the crate
-//! `skein-transport` carries the records; `skein-run` manages files and processes.
+//! [`summary`]) and progress reports ([`progress`]), and how such files are read ([`files`]). It
+//! only defines them: the crate `skein-transport` carries the records; `skein-run` manages files
+//! and processes.
 
 pub mod config;
 pub mod encoder_file;
 pub mod evaluation;
+pub mod files;
 pub mod ids;
 pub mod progress;
 pub mod seeds;
@@ -22,7 +24,7 @@ pub mod transition;
 
 /// Version of everything in this crate that crosses a process boundary. It is an attribute of every
 /// service: a process of another version is refused when it opens one.
-pub const PROTOCOL_VERSION: u32 = 9;
+pub const PROTOCOL_VERSION: u32 = 10;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -43,7 +45,7 @@ pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
 /// Length of an action: lateral and vertical velocity, each in [-1, 1].
 pub const ACTION: usize = 2;
 /// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
-pub const GROUND_TRUTH: usize = 16;
+pub const GROUND_TRUTH: usize = 18;
 /// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
 /// `[2]` and previous action.
 pub const CRITIC_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;

@@ -41,12 +41,14 @@ pub enum Purpose {
     Bootstrap = 13,
     /// Generated course of a confirmation episode; indexed by episode.
     ConfirmationCourse = 14,
+    /// Steps of an episode that the teacher flies; derived from the ticket's seed.
+    TeacherSteps = 15,
     /// Courses and poses of the views that an encoder is trained on; indexed by course.
-    EncoderViews = 20,
+    EncoderViews = 16,
     /// Reparameterisation noise of a step that trains an encoder; indexed by step.
-    EncoderNoise = 21,
+    EncoderNoise = 17,
     /// Courses and poses of the views on which an encoder is measured; indexed by course.
-    MeasuredViews = 22,
+    MeasuredViews = 18,
 }
 
 /// Returns the seed for the `index`-th use of `purpose` in the run seeded `run_seed`.

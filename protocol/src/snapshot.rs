@@ -6,7 +6,7 @@
 //! configuration in the metadata, so that the file alone can be flown.
 
 use std::collections::HashMap;
-use std::fs;
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -17,6 +17,7 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::ACTION;
 use crate::config::{AlgorithmName, Config, ObservationLayout};
+use crate::files::{self, TENSOR_BYTES};
 use crate::ids::{PolicyVersion, RunId};
 
 /// Channels of the encoder's four 4×4 convolutions of stride 2; the first entry is the image's
@@ -106,6 +107,7 @@ impl SnapshotLayout {
     pub fn of(config: &Config) -> Self {
         let (hidden_width, head) = match config.learning.algorithm {
             AlgorithmName::Sac => (config.sac.hidden_width, PolicyHead::SquashedGaussian),
+            AlgorithmName::Distill => (config.distill.hidden_width, PolicyHead::SquashedGaussian),
             AlgorithmName::Td3 => (
                 config.td3.hidden_width,
                 PolicyHead::Noisy(config.td3.exploration_noise as f32),
@@ -235,14 +237,27 @@ pub enum SnapshotError {
         /// The tensor.
         tensor: String,
     },
-    /// The file cannot be read or written.
+    /// The file cannot be read.
+    #[error(
+        "cannot read the snapshot {}: {source}{}",
+        path.display(),
+        remedy(source)
+    )]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Cause.
+        #[source]
+        source: io::Error,
+    },
+    /// The file cannot be written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file.
         path: PathBuf,
         /// Cause.
         #[source]
-        source: std::io::Error,
+        source: io::Error,
     },
     /// The file is not a snapshot of this version.
     #[error("{} is not a snapshot of this version: {problem}", path.display())]
@@ -332,7 +347,7 @@ impl Snapshot {
     /// # Errors
     /// [`SnapshotError`] names the file and the problem.
     pub fn load(path: &Path) -> Result<(Self, Config), SnapshotError> {
-        let bytes = fs::read(path).map_err(|source| SnapshotError::Io {
+        let bytes = files::read(path, TENSOR_BYTES).map_err(|source| SnapshotError::Read {
             path: path.to_owned(),
             source,
         })?;
@@ -351,6 +366,16 @@ impl Snapshot {
     }
 }
 
+/// Returns the remedy, if there is one.
+fn remedy(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::NotFound => {
+            "; name a file such as DIR/snapshots/best.safetensors, or a run with --run DIR"
+        }
+        _ => "",
+    }
+}
+
 pub(crate) const FORMAT_KEY: &str = "skein.format";
 const FORMAT: &str = "policy-snapshot-2";
 /// Metadata key of the [`checksum`].
@@ -358,8 +383,8 @@ pub(crate) const CHECKSUM_KEY: &str = "skein.checksum";
 const VERSION_KEY: &str = "skein.policy_version";
 pub(crate) const CONFIG_KEY: &str = "skein.config";
 
-/// Returns the xxh3 of a parameter file's content in hexadecimal. Nothing else detects a flipped bit
-/// that leaves finite numbers.
+/// Returns the xxh3 of a parameter file's content in hexadecimal. Nothing else detects a flipped
+/// bit that leaves finite numbers.
 pub(crate) fn checksum(texts: &[&str], values: &[f32]) -> String {
     let mut hasher = Xxh3::new();
     for text in texts {
@@ -491,6 +516,8 @@ fn values_of(bytes: &[u8]) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::config::Observation;
 

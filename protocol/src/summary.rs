@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::config::Config;
+use crate::files::{self, REPORT_BYTES};
 use crate::ids::{PolicyVersion, RunId};
 use crate::stages::StageTimes;
 
@@ -85,7 +86,7 @@ impl RunSummary {
 
     /// Reads the summary at `path`; returns `None` if there is none, or it cannot be read.
     pub fn load(path: &Path) -> Option<Self> {
-        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+        serde_json::from_slice(&files::read(path, REPORT_BYTES).ok()?).ok()
     }
 
     /// Returns the summary as JSON, for its file.

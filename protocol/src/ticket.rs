@@ -29,6 +29,9 @@ pub struct Ticket {
     pub exploration: Exploration,
     /// Seed of everything random in the episode.
     pub seed: u64,
+    /// Share of the steps that the teacher flies, in [0, 1]; its action is then in every record.
+    /// `None` where no teacher is asked.
+    pub teacher_share: Option<f32>,
     /// The part of the episode to fly; `None` for all of it.
     pub segment: Option<Segment>,
 }
@@ -78,7 +81,7 @@ pub enum Control {
 }
 
 /// [`Control`] on the wire, addressed to one actor or, for heartbeats and the stop, to all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct ControlRecord {
     run: u64,
@@ -94,11 +97,14 @@ pub struct ControlRecord {
     course_kind: u8,
     start_level: u8,
     exploration: u8,
+    /// 1 if the teacher is asked.
+    teacher: u32,
+    teacher_share: f32,
 }
 
-// Six 8-byte and three 4-byte fields, then four bytes: no padding, so no uninitialised byte ever
-// leaves the process.
-const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4);
+// Six 8-byte and three 4-byte fields, four bytes, then two 4-byte fields: no padding, so no
+// uninitialised byte ever leaves the process.
+const _: () = assert!(size_of::<ControlRecord>() == 6 * 8 + 3 * 4 + 4 + 2 * 4);
 
 const ALL_ACTORS: u32 = u32::MAX;
 
@@ -128,6 +134,8 @@ impl ControlRecord {
                 Exploration::Sample => 1,
                 Exploration::Mode => 2,
             },
+            teacher: u32::from(ticket.teacher_share.is_some()),
+            teacher_share: ticket.teacher_share.unwrap_or_default(),
         }
     }
 
@@ -165,6 +173,8 @@ impl ControlRecord {
             course_kind: 0,
             start_level: 0,
             exploration: 0,
+            teacher: 0,
+            teacher_share: 0.0,
         }
     }
 
@@ -230,8 +240,18 @@ impl ControlRecord {
                 }
             },
             seed: self.seed,
+            teacher_share: self.teacher_share()?,
             segment: None,
         })
+    }
+
+    fn teacher_share(&self) -> Result<Option<f32>, ControlFault> {
+        match self.teacher {
+            0 => Ok(None),
+            // NaN is outside every range.
+            1 if (0.0..=1.0).contains(&self.teacher_share) => Ok(Some(self.teacher_share)),
+            _ => Err(ControlFault::TeacherShare(self.teacher_share)),
+        }
     }
 }
 
@@ -279,7 +299,7 @@ impl ControlMessage {
 }
 
 /// Reason why a control record is refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum ControlFault {
     /// The record belongs to another run.
     #[error("control record of run {0:016x}")]
@@ -292,6 +312,9 @@ pub enum ControlFault {
         /// Its value.
         value: u8,
     },
+    /// The teacher's share is none.
+    #[error("control record with teacher_share = {0}, which is outside [0, 1]")]
+    TeacherShare(f32),
     /// The ticket of a segment is invalid.
     #[error("the ticket of a segment {0}")]
     Segment(&'static str),
@@ -311,6 +334,7 @@ pub(crate) mod tests {
             start_level: 2,
             exploration: Exploration::Sample,
             seed: 42,
+            teacher_share: Some(0.25),
             segment: None,
         }
     }
@@ -361,6 +385,16 @@ pub(crate) mod tests {
                 value: 77
             })
         );
+        record.exploration = 1;
+        for share in [-0.1, 1.5, f32::NAN] {
+            record.teacher_share = share;
+            assert!(matches!(
+                record.read(RunId(3)),
+                Err(ControlFault::TeacherShare(_))
+            ));
+        }
+        record.teacher_share = 0.0;
+        assert!(record.read(RunId(3)).is_ok());
         record.start_level = 0;
         assert!(record.read(RunId(3)).is_err());
     }

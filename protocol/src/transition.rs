@@ -18,8 +18,8 @@ pub const MAX_MAGNITUDE: f32 = 1e7;
 
 /// Bytes between `hit_wall` and `ground_truth`, so that the image starts on a cache line.
 const RESERVED: usize = {
-    // 361: the header's other fields.
-    let used = size_of::<f32>() * REWARD_TERMS + 361;
+    // 305: the header's other fields.
+    let used = size_of::<f32>() * (REWARD_TERMS + GROUND_TRUTH) + 305;
     used.next_multiple_of(64) - used
 };
 
@@ -61,6 +61,9 @@ pub struct TransitionRecord {
     pub latent: LatentCode,
     /// Lateral and vertical velocity command, each in [-1, 1].
     pub action: [f32; ACTION],
+    /// The teacher's action for the same observation, each in [-1, 1]; zero if the ticket asks for
+    /// none.
+    pub teacher_action: [f32; ACTION],
     /// Sum of `reward_terms`.
     pub reward: f32,
     /// The terms of the reward: [`REWARD_TERM_NAMES`](crate::REWARD_TERM_NAMES).
@@ -85,7 +88,7 @@ pub struct TransitionRecord {
     pub depth: [u8; IMAGE_PIXELS],
 }
 
-// The header is whole cache lines (seven for four terms of the reward), so the image starts on a
+// The header is whole cache lines (eight for four terms of the reward), so the image starts on a
 // cache line in samples aligned to one (see `services`). There is no padding, so the record is
 // plain data.
 const HEADER: usize = std::mem::offset_of!(TransitionRecord, depth);
@@ -269,6 +272,7 @@ impl TransitionRecord {
         finite("latent", &self.latent)?;
         finite("ground_truth", &self.ground_truth)?;
         finite("action", &self.action)?;
+        finite("teacher_action", &self.teacher_action)?;
         finite("reward", &[self.reward])?;
         finite("reward_terms", &self.reward_terms)?;
         // Summed in the actor's order, so that the sums are bit-equal.
@@ -278,10 +282,10 @@ impl TransitionRecord {
                 what: "the reward is not the sum of its terms",
             });
         }
-        if self.action.iter().any(|value| value.abs() > 1.0) {
-            return Err(RecordFault::ActionOutOfRange {
-                action: self.action,
-            });
+        for action in [self.action, self.teacher_action] {
+            if action.iter().any(|value| value.abs() > 1.0) {
+                return Err(RecordFault::ActionOutOfRange { action });
+            }
         }
         for (name, value) in [
             ("level_up", self.level_up),
@@ -400,6 +404,7 @@ mod tests {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 9,
+            teacher_share: None,
             segment: None,
         }
     }

@@ -64,7 +64,8 @@ fn fly(side: f32) -> CommittedEpisode {
     simulator
         .reset(1, &mut start, &mut calm)
         .expect("every course has a first level");
-    let (mut observations, mut actions, mut depth) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut observations, mut depth) = (Vec::new(), Vec::new());
+    let (mut actions, mut teacher_actions) = (Vec::new(), Vec::new());
     for step in 0..=STEPS {
         let mut image = [0; IMAGE_PIXELS];
         simulator.render(&mut image);
@@ -79,9 +80,11 @@ fn fly(side: f32) -> CommittedEpisode {
         });
         if step < STEPS {
             let phase = step as f32;
+            let taught = simulator.oracle_action();
             let action = [side * (0.7 * phase).sin(), (0.4 * phase).cos()];
             simulator.step(action).expect("nothing is hit so soon");
             actions.push(action);
+            teacher_actions.push(taught);
         }
     }
     CommittedEpisode {
@@ -102,6 +105,7 @@ fn fly(side: f32) -> CommittedEpisode {
         hit_wall: None,
         depth: Some(depth),
         actions,
+        teacher_actions,
     }
 }
 
@@ -109,6 +113,11 @@ fn fly(side: f32) -> CommittedEpisode {
 fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
     let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
     assert_eq!(mirrored.actions, flown.actions);
+    for (one, other) in mirrored.teacher_actions.iter().zip(&flown.teacher_actions) {
+        for (one, other) in one.iter().zip(other) {
+            assert!((one - other).abs() < 2e-3, "teacher: {one} and {other}");
+        }
+    }
     for (step, (one, other)) in mirrored
         .observations
         .iter()
@@ -158,6 +167,7 @@ fn mirroring_swaps_left_and_right_and_nothing_else() {
             mass_factor: 1.1,
             latency_periods: 1.0,
             gust_n: [0.1, side * 0.2, 0.3],
+            half_section_m: [3.0, 3.5],
         }
     };
     let mut flown = fly(1.0);

@@ -38,6 +38,7 @@ fn the_shipped_configurations_exist() {
     assert_eq!(
         names,
         [
+            "distill.toml",
             "encoder.toml",
             "generalist.toml",
             "local.toml",

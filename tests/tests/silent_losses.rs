@@ -106,6 +106,7 @@ impl Run {
             start_level: 1,
             exploration: Exploration::Uniform,
             seed: episode,
+            teacher_share: None,
             segment: None,
         }
     }

@@ -94,17 +94,64 @@ fn no_text_uses_words_that_a_stranger_stumbles_over() {
     assert!(found.is_empty(), "{found:#?}");
 }
 
-/// Places that a test might take for missing: some machines have them.
-const FOREIGN_PLACES: [&str; 3] = ["/nonexistent", "/nowhere", "/no/such"];
+/// First folders of absolute paths that code may name: they are on every machine.
+const EVERYWHERE: [&str; 6] = ["bin", "dev", "etc", "proc", "sys", "tmp"];
+/// First names of absolute paths that tests only compare. No file of them is ever looked for.
+const ONLY_COMPARED: [&str; 9] = [
+    "courses",
+    "d.toml",
+    "elsewhere",
+    "m",
+    "mine",
+    "no-run-has-this-name",
+    "runs",
+    "somewhere",
+    "tests",
+];
+
+/// Returns the absolute paths at the beginning of the string literals in a line of code.
+fn absolute_paths(line: &str) -> impl Iterator<Item = &str> {
+    let quoted = line.split('"').skip(1);
+    let is_path = |text: &&str| {
+        text.strip_prefix('/').is_some_and(|rest| {
+            rest.starts_with(|first: char| first.is_alphanumeric() || first == '_')
+        })
+    };
+    quoted.filter(is_path)
+}
+
+fn is_foreign(path: &str) -> bool {
+    let is_part = |sign: char| sign.is_alphanumeric() || "-_.".contains(sign);
+    let first = path[1..].split(|sign| !is_part(sign)).next().unwrap_or("");
+    !EVERYWHERE.contains(&first) && !ONLY_COMPARED.contains(&first)
+}
+
+#[test]
+fn a_foreign_place_is_found_wherever_it_stands_in_a_line() {
+    let found = |line: &str| absolute_paths(line).any(is_foreign);
+    assert!(found(r#"open(&format!("{x}"), Path::new("/void/file"))"#));
+    assert!(found(r#""/missing""#));
+    for sound in [
+        r#"("/dev/null", "/tmp")"#,
+        r#"join("a/b")"#,
+        r#""/m/run: x""#,
+    ] {
+        assert!(!found(sound), "{sound}");
+    }
+}
 
 #[test]
 fn no_test_counts_on_a_place_that_it_did_not_make() {
-    let found: Vec<_> = lines(&["rs"])
-        .into_iter()
-        .filter(|(_, line)| FOREIGN_PLACES.iter().any(|place| line.contains(place)))
-        .map(|(place, line)| format!("{place}: {line}: make a folder, name a file missing in it"))
-        .collect();
-    assert!(found.is_empty(), "{found:#?}");
+    let mut found = vec![];
+    for (place, line) in lines(&["rs"]) {
+        for path in absolute_paths(&line).filter(|path| is_foreign(path)) {
+            found.push(format!("{place}: {path}"));
+        }
+    }
+    assert!(
+        found.is_empty(),
+        "some machine has or lacks these: make a folder, or name a file missing in it: {found:#?}"
+    );
 }
 
 #[test]
@@ -137,16 +184,40 @@ fn no_doc_comment_hides_its_noun() {
     assert!(found.is_empty(), "{found:#?}");
 }
 
+/// Returns `true` if a line of code uses a printing macro of the standard library.
+fn prints(line: &str) -> bool {
+    let code = line.split("//").next().unwrap_or("");
+    let is_name = |sign: char| sign.is_alphanumeric() || sign == '_';
+    ["println", "eprintln", "print", "eprint", "dbg"]
+        .iter()
+        .any(|name| {
+            code.match_indices(&format!("{name}!"))
+                .any(|(place, _)| !code[..place].ends_with(is_name))
+        })
+}
+
+#[test]
+fn a_printing_macro_is_found_wherever_it_stands_in_a_line() {
+    for line in [
+        "println!(\"x\");",
+        "None => eprint!(\"x\"),",
+        "if x { std::print! { \"x\" } }",
+        "(dbg!(x))",
+    ] {
+        assert!(prints(line), "{line}");
+    }
+    for line in ["note!(\"x\");", "/// As `println!` does.", "my_println!(x)"] {
+        assert!(!prints(line), "{line}");
+    }
+}
+
 #[test]
 fn no_program_prints_with_macros_that_panic_when_the_terminal_is_gone() {
     let mut found = vec![];
     for (place, line) in lines(&["rs"]) {
         let is_program = place.contains("src/") && !place.contains("tests.rs");
         let is_test = place.contains("/tests/mod.rs") || place.contains("tests/src/");
-        let prints = ["println!(", "eprintln!(", "print!(", "eprint!("]
-            .iter()
-            .any(|printing| line.trim_start().starts_with(printing));
-        if is_program && !is_test && prints {
+        if is_program && !is_test && prints(&line) {
             found.push(place);
         }
     }
@@ -154,4 +225,31 @@ fn no_program_prints_with_macros_that_panic_when_the_terminal_is_gone() {
         found.is_empty(),
         "use show! and note! of skein-run: {found:#?}"
     );
+}
+
+/// Programs that end users start or that are started for them: files with a function `main`.
+#[test]
+fn every_program_survives_the_limit_of_file_sizes() {
+    let mut found = vec![];
+    files(repository(), &["rs"], &mut found);
+    let mut programs = 0;
+    for path in found {
+        let is_program =
+            path.ends_with("main.rs") || path.components().any(|part| part.as_os_str() == "bin");
+        let text = fs::read_to_string(&path).unwrap();
+        let Some((_, main)) = text.split_once("\nfn main() -> ExitCode {\n") else {
+            continue;
+        };
+        if is_program {
+            programs += 1;
+            let first = main.lines().next().unwrap_or("");
+            assert_eq!(
+                first.trim(),
+                "survive_file_size_limit();",
+                "{}",
+                path.display()
+            );
+        }
+    }
+    assert!(programs >= 6, "only {programs} programs were found");
 }

@@ -78,6 +78,7 @@ pub(crate) fn ticket(run: RunId, episode: u64, level: u8) -> Ticket {
         start_level: level,
         exploration: Exploration::Sample,
         seed: episode,
+        teacher_share: None,
         segment: None,
     }
 }

@@ -27,7 +27,7 @@ pub struct Courses {
 pub struct EvaluationEntry {
     /// Courses, and their name in reports.
     pub entry: SuiteEntry,
-    /// Simulator settings: the run's, with the entry's disturbances.
+    /// Simulator settings: the run's, with the entry's disturbances and step limit.
     settings: SimulatorSettings,
 }
 
@@ -66,6 +66,7 @@ impl Courses {
                 episodes: config.evaluation.episodes,
                 courses: EntryCourses::Listed(vec![load(path.as_ref())?]),
                 disturbances: settings.disturbances.clone(),
+                max_steps: None,
             };
             Ok(EvaluationEntry {
                 entry,
@@ -98,10 +99,7 @@ impl Courses {
                     entry: entry.name.clone(),
                     source,
                 })?;
-            let settings = SimulatorSettings {
-                disturbances: entry.disturbances.clone(),
-                ..settings.clone()
-            };
+            let settings = entry.settings(&settings);
             Ok(EvaluationEntry { entry, settings })
         };
         let evaluation = suite
@@ -190,10 +188,11 @@ impl Courses {
                     settings,
                 )
             }
-            CourseChoice::Generated(seed) => (
-                Arc::new(Course::generate(seed, &self.settings.generator)?),
-                &self.settings,
-            ),
+            CourseChoice::Generated(seed) => {
+                let (level, ranges) = (ticket.start_level, &self.settings.generator);
+                let course = Course::generate_from_level(seed, level, ranges)?;
+                (Arc::new(course), &self.settings)
+            }
         };
         Ok(Simulator::new(course, settings)?)
     }
@@ -203,7 +202,7 @@ impl Courses {
         let choice = ticket.course;
         Ok(match choice {
             CourseChoice::Training => None,
-            CourseChoice::Generated(_) => Some((choice, 0)),
+            CourseChoice::Generated(_) => Some((choice, ticket.start_level.into())),
             CourseChoice::Evaluation(index) => match &self.entry(choice, index)?.entry.courses {
                 EntryCourses::Listed(courses) if courses.len() == 1 => None,
                 several => Some((choice, several.number_of(evaluation_episode(ticket)))),
@@ -336,6 +335,7 @@ mod tests {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: 1,
+            teacher_share: None,
             segment: None,
         }
     }
@@ -387,7 +387,7 @@ mod tests {
         assert_eq!(simulators.fixed.len(), 1);
         assert_eq!(
             simulators.one_off.unwrap().0,
-            (CourseChoice::Generated(2), 0)
+            (CourseChoice::Generated(2), 1)
         );
     }
 

@@ -8,7 +8,7 @@
 
 use std::ops::DerefMut;
 
-use rand::SeedableRng;
+use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::evaluation::EpisodeScore;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
@@ -82,6 +82,7 @@ impl EnvironmentLoop {
         // Each segment has its own generator: an actor that flies a later one need not know how
         // often the earlier ones drew.
         let mut noise = generator(ticket, Purpose::ActionNoise, ticket.first_step());
+        let mut teacher_steps = generator(ticket, Purpose::TeacherSteps, ticket.first_step());
         let begin = |link: &mut L, step| {
             let mut record = link.loan().map_err(EpisodeError::Link)?;
             record.begin(ticket, self.actor, self.incarnation, step);
@@ -104,13 +105,23 @@ impl EnvironmentLoop {
                 return Err(EpisodeError::Abandoned);
             }
             let previous_action = flown.last().copied().unwrap_or_default();
-            let action = self.agent.act(
+            let own_action = self.agent.act(
                 ticket.exploration,
                 network,
                 &record,
                 &previous_action,
                 &mut noise,
             );
+            let action = match ticket.teacher_share {
+                Some(share) => {
+                    record.teacher_action = simulator.oracle_action();
+                    match teacher_steps.random::<f32>() < share {
+                        true => record.teacher_action,
+                        false => own_action,
+                    }
+                }
+                None => own_action,
+            };
             link.lap(Stage::Policy);
             let report = match simulator.step(action) {
                 Ok(report) => report,
@@ -361,6 +372,7 @@ fn close(
     record.hit_wall = hit_wall.unwrap_or(0);
     EpisodeScore {
         walls_passed: report.walls_passed.into(),
+        walls: course.levels().into(),
         // As in `episodes.csv`. For a segment, its rewards only.
         episode_return: f64::from(episode_return as f32),
         outcome,

@@ -69,8 +69,6 @@ pub struct EvaluationResult {
 pub struct EvaluatedEpisode {
     /// Score.
     pub score: EpisodeScore,
-    /// Walls of the course.
-    pub walls: usize,
     /// Positions of the drone at each step and at the end, world frame, metres, if they are kept.
     pub positions_m: Vec<[f32; 3]>,
     /// Its steps and its closing record, if they are kept.
@@ -128,12 +126,7 @@ impl Evaluation<'_> {
                 .iter()
                 .map(|episode: &EvaluatedEpisode| episode.score)
                 .collect();
-            let walls = episodes
-                .iter()
-                .map(|episode| episode.walls)
-                .max()
-                .unwrap_or(0);
-            courses.push(CourseEvaluation::of(&entry.name, walls, &scores));
+            courses.push(CourseEvaluation::of(&entry.name, &scores));
             by_course.push(episodes);
         }
         let report = EvaluationReport {
@@ -237,6 +230,7 @@ impl Evaluation<'_> {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
+            teacher_share: None,
             segment: None,
         };
         let mut memory = MemoryLink {
@@ -244,7 +238,6 @@ impl Evaluation<'_> {
                 Keep::Positions(first) if episode >= first => Keep::Scores,
                 keep => keep,
             },
-            walls: 0,
             positions_m: Vec::new(),
             spare: Vec::new(),
             sent: Vec::new(),
@@ -252,7 +245,6 @@ impl Evaluation<'_> {
         match environment_loop.fly(&ticket, network, &mut memory) {
             Ok(Some(score)) => Ok(EvaluatedEpisode {
                 score,
-                walls: memory.walls,
                 positions_m: memory.positions_m,
                 records: memory.sent,
             }),
@@ -275,8 +267,6 @@ impl Evaluation<'_> {
 /// Link that keeps records in plain memory.
 struct MemoryLink {
     keep: Keep,
-    /// Walls of the course, from the closing record.
-    walls: usize,
     positions_m: Vec<[f32; 3]>,
     spare: Vec<Box<TransitionRecord>>,
     sent: Vec<Box<TransitionRecord>>,
@@ -294,7 +284,6 @@ impl RecordLink for MemoryLink {
     }
 
     fn send(&mut self, record: Box<TransitionRecord>) -> Result<(), Infallible> {
-        self.walls = record.course_walls.into();
         if self.keep != Keep::Scores {
             self.positions_m.push(record.position_m);
         }

@@ -9,6 +9,7 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use skein_protocol::files::destination;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH, REWARD_TERM_NAMES, REWARD_TERMS};
 use zip::ZipWriter;
@@ -244,9 +245,11 @@ pub fn write_recording(
     latent: usize,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
-    let temporary = temporary_path(path);
+    // A link stays a link: the recording goes where it leads.
+    let target = destination(path).unwrap_or_else(|| path.to_owned());
+    let temporary = temporary_path(&target);
     write_npz(&temporary, courses, latent, episodes)
-        .and_then(|()| fs::rename(&temporary, path))
+        .and_then(|()| fs::rename(&temporary, &target))
         .map_err(|source| {
             // A partial recording is useless. If there is none, removing it does nothing.
             let _ = fs::remove_file(&temporary);
@@ -264,7 +267,8 @@ pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
         let source = io::Error::other("it is not a regular file, so a recording cannot replace it");
         return Err(failed(path, source));
     }
-    let temporary = temporary_path(path);
+    let target = destination(path).unwrap_or_else(|| path.to_owned());
+    let temporary = temporary_path(&target);
     File::create(&temporary)
         .and_then(|_| fs::remove_file(&temporary))
         .map_err(|source| failed(path, source))
@@ -397,13 +401,13 @@ mod tests {
         };
         let score = EpisodeScore {
             walls_passed: 0,
+            walls: 5,
             episode_return: 0.0,
             outcome: Outcome::Collided,
             hit_wall: None,
         };
         EvaluatedEpisode {
             score,
-            walls: 5,
             positions_m: Vec::new(),
             records: (first..first + records).map(record).collect(),
         }
@@ -515,6 +519,16 @@ mod tests {
             let error = error.unwrap_err().to_string();
             assert!(error.contains(file.to_str().unwrap()), "{error}");
         }
+    }
+
+    #[test]
+    fn a_recording_goes_where_a_link_leads_and_the_link_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let [target, link] = ["there.npz", "link.npz"].map(|name| folder.path().join(name));
+        std::os::unix::fs::symlink(&target, &link).unwrap();
+        check_recordable(&link).unwrap();
+        write_recording(&link, &[], 32, &[]).unwrap();
+        assert!(link.is_symlink() && target.is_file());
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! The environment step, half a second of an episode: physics alone, and with the depth image.
 //!
 //! An iteration is a whole episode through the training course, flown by the oracle, with its
-//! reset.
+//! reset. `random_course` is what an episode on a new course adds: to generate it, and to build its
+//! simulator.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -11,8 +12,7 @@ use criterion::{BenchmarkId, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::IMAGE_PIXELS;
-use skein_simulator::course::Course;
-use skein_simulator::oracle::Oracle;
+use skein_simulator::course::{Course, GeneratorRanges};
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
@@ -54,7 +54,24 @@ fn main() {
         }
     }
     group.finish();
+    random_course(&mut criterion);
     criterion.final_summary();
+}
+
+fn random_course(criterion: &mut Criterion) {
+    let (ranges, settings) = (GeneratorRanges::default(), SimulatorSettings::default());
+    let mut seeds = 0..;
+    let mut generate = || {
+        let seed = seeds.next().expect("seeds are endless");
+        Course::generate(seed, &ranges).expect("default ranges can be flown")
+    };
+    let mut group = criterion.benchmark_group("random_course");
+    let course = Arc::new(generate());
+    group.bench_function("generate", |bencher| bencher.iter(&mut generate));
+    group.bench_function("simulator", |bencher| {
+        bencher.iter(|| Simulator::new(Arc::clone(&course), &settings).is_ok());
+    });
+    group.finish();
 }
 
 /// Flies once through the course and returns the number of steps.
@@ -65,7 +82,7 @@ fn fly(simulator: &mut Simulator, camera: Camera) -> u64 {
         .reset(1, &mut rng.clone(), &mut rng)
         .expect("every course has a first level");
     for steps in 1.. {
-        let action = Oracle::act(simulator.course(), &simulator.state());
+        let action = simulator.oracle_action();
         let report = simulator
             .step(action)
             .expect("the oracle's commands are finite");

@@ -12,7 +12,6 @@ use std::sync::Arc;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::course::Course;
-use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{EpisodeOutcome, Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
@@ -65,7 +64,7 @@ fn fly(simulator: &mut Simulator, level: u8, seed: u64) -> Result<EpisodeOutcome
     let [mut start, mut calm] = [seed, 0].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(level, &mut start, &mut calm)?;
     loop {
-        let action = Oracle::act(simulator.course(), &simulator.state());
+        let action = simulator.oracle_action();
         if let Some(outcome) = simulator.step(action)?.outcome {
             return Ok(outcome);
         }

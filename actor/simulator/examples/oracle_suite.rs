@@ -13,7 +13,6 @@ use std::sync::Arc;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
-use skein_simulator::oracle::Oracle;
 use skein_simulator::simulator::{
     EpisodeOutcome, Obstacle, Simulator, SimulatorSettings, StepReport,
 };
@@ -40,10 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 
 /// Flies an entry and returns its row of the table.
 fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
-    let settings = SimulatorSettings {
-        disturbances: entry.disturbances.clone(),
-        ..Default::default()
-    };
+    let settings = entry.settings(&SimulatorSettings::default());
     let (mut arrived, mut passed, mut walls) = (0, 0, 0);
     let (mut hit_wall, mut hit_corridor, mut timed_out) = (0, 0, 0);
     for episode in 0..episodes {
@@ -71,7 +67,7 @@ fn fly(mut simulator: Simulator, seed: u64) -> Result<StepReport, Box<dyn Error>
     let [mut start, mut disturbances] = [seed, !seed].map(Pcg64Mcg::seed_from_u64);
     simulator.reset(1, &mut start, &mut disturbances)?;
     loop {
-        let action = Oracle::act(simulator.course(), &simulator.state());
+        let action = simulator.oracle_action();
         let report = simulator.step(action)?;
         if report.outcome.is_some() {
             return Ok(report);

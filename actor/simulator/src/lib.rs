@@ -16,18 +16,19 @@
 //! | [`camera`] | depth image, with or without a stereo camera's errors |
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
 //! | [`suite`] | evaluation suites |
-//! | [`oracle`] | a scripted expert that knows the course |
+//! | [`text`] | rules for names and lists in files |
 //! | [`viewpoints`] | depth images from random poses |
 
+mod body;
 pub mod camera;
 pub mod course;
 pub mod disturbances;
-pub mod oracle;
+mod oracle;
 pub mod reward;
 pub mod simulator;
 mod step_report;
 pub mod suite;
-mod text;
+pub mod text;
 pub mod vehicle;
 pub mod viewpoints;
 mod world;

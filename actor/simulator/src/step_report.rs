@@ -19,7 +19,7 @@ pub enum EpisodeOutcome {
 pub enum LevelUp {
     /// It passed none.
     No,
-    /// Its centre left a wall behind.
+    /// Its tail left a wall behind: the whole body is clear of it.
     Yes,
 }
 

@@ -1,4 +1,4 @@
-//! Text files from outside the process.
+//! Text from outside the process.
 
 use std::fs;
 use std::io;
@@ -37,8 +37,12 @@ pub(crate) fn parse_whole<T: DeserializeOwned>(text: &str) -> Result<T, toml::de
     Ok(parsed)
 }
 
-/// Returns the parser's error on one line, with the key if the error has no place in the text.
-pub(crate) fn message_of(error: &toml::de::Error) -> String {
+/// Returns the parser's error on `text` on one line, with the key if the error has no place in the
+/// text.
+pub(crate) fn message_of(text: &str, error: &toml::de::Error) -> String {
+    if let Some(message) = integer_too_large(text, error) {
+        return message;
+    }
     let text = match error.span() {
         Some(_) => error.message().to_owned(),
         None => error.to_string(),
@@ -46,12 +50,67 @@ pub(crate) fn message_of(error: &toml::de::Error) -> String {
     text.trim_end().replace('\n', " ")
 }
 
+/// Returns key, value and remedy if `error` is an integer that TOML does not hold: the parser knows
+/// only the type.
+fn integer_too_large(text: &str, error: &toml::de::Error) -> Option<String> {
+    let place = error.span()?;
+    let value = text.get(place.clone()).filter(|value| is_integer(value))?;
+    // One that TOML holds was refused for another reason.
+    if toml::from_str::<toml::Table>(&format!("value = {value}")).is_ok() {
+        return None;
+    }
+    Some(format!(
+        "`{}` = {value} is outside {} to {}: choose an integer within",
+        key_before(text, place.start),
+        i64::MIN,
+        i64::MAX
+    ))
+}
+
+/// `true` for an integer in TOML's notation, of any size.
+fn is_integer(text: &str) -> bool {
+    let unsigned = text.strip_prefix(['+', '-']).unwrap_or(text);
+    let (digits, radix) = match unsigned.get(..2) {
+        Some("0x") => (&unsigned[2..], 16),
+        Some("0o") => (&unsigned[2..], 8),
+        Some("0b") => (&unsigned[2..], 2),
+        _ => (unsigned, 10),
+    };
+    digits.starts_with(|first: char| first.is_digit(radix))
+        && digits
+            .chars()
+            .all(|digit| digit.is_digit(radix) || digit == '_')
+}
+
+/// Returns the key whose value begins at byte `start` of the TOML `text`.
+fn key_before(text: &str, start: usize) -> &str {
+    let before = text.get(..start).unwrap_or_default();
+    let key = before
+        .rsplit_once('=')
+        .map_or("", |(key, _)| key.trim_end());
+    let ends = |sign: char| sign.is_whitespace() || ",{".contains(sign);
+    key.rsplit(ends).next().unwrap_or_default()
+}
+
+/// Returns `true` if `name` can be shown on a terminal and in a table: it is one line, without
+/// control characters and `|`.
+pub fn fits_in_a_table(name: &str) -> bool {
+    !name.contains(|sign: char| sign.is_control() || sign == '|')
+}
+
+/// Returns the first of `items` that an earlier one equals.
+pub fn first_repeated<T: PartialEq>(items: &[T]) -> Option<&T> {
+    (1..items.len())
+        .find(|&index| items[..index].contains(&items[index]))
+        .map(|index| &items[index])
+}
+
 /// Deserializes exactly `N` numbers. The parser alone ignores further ones.
-pub(crate) fn exactly<'de, D: Deserializer<'de>, const N: usize>(
+pub(crate) fn exactly<'de, D: Deserializer<'de>, T: Deserialize<'de>, const N: usize>(
     deserializer: D,
-) -> Result<[f32; N], D::Error> {
-    let numbers = Vec::<f32>::deserialize(deserializer)?;
-    numbers.try_into().map_err(|numbers: Vec<f32>| {
+) -> Result<[T; N], D::Error> {
+    let numbers = Vec::<T>::deserialize(deserializer)?;
+    numbers.try_into().map_err(|numbers: Vec<T>| {
         D::Error::custom(format!(
             "has {} numbers: give {N} (a decimal point is a dot)",
             numbers.len()

@@ -19,8 +19,9 @@ use crate::world::World;
 const ON_THE_WAY: f32 = 0.5;
 /// Standard deviation of those poses from the way, left and up, metres.
 const OFF_THE_WAY_M: f32 = 0.5;
-/// Standard deviation of roll and pitch, radians. The oracle's roll and pitch are 0.02 and 0.01 root
-/// mean square; a policy that explores tilts more. Every vehicle keeps its nose along the corridor.
+/// Standard deviation of roll and pitch, radians. The oracle's roll and pitch are 0.02 and 0.01
+/// root mean square; a policy that explores tilts more. Every vehicle keeps its nose along the
+/// corridor.
 const TILT_RAD: f32 = 0.03;
 /// Distance of a wall below which the edges of its opening leave the image, metres.
 const TOO_NEAR_M: f32 = 0.5;

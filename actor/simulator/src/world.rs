@@ -1,23 +1,21 @@
-//! The rigid body among the course's surfaces: rapier integrates it, parry finds what it touches.
+//! The body among the course's surfaces: what it touches.
 //!
-//! Any contact ends an episode, so contact forces never act and rapier's solver has nothing to
-//! solve: the course is not in rapier's world at all. After each physics step, the body's cuboid is
-//! tested exactly against the triangles that the depth camera also draws. A bounding-volume tree
-//! makes that test take some 0.1 µs when nothing is near. The body moves centimetres a step and is
-//! longer than that in every direction it can move, so it cannot pass a surface between two tests.
-//!
-//! rapier and parry use glam, the rest of this crate uses nalgebra: only this file converts between
-//! them.
+//! Any contact ends an episode, so contact forces never act: after each physics step, the body's
+//! cuboid is tested exactly against the surfaces that the depth camera also draws. The corridor's
+//! inside is a box, so the cuboid's bounds decide whether it touches that; a wall is tested,
+//! triangle by triangle, only while the bounds reach into it. The body moves centimetres a step and
+//! is longer than that in every direction it can move, so it cannot pass a surface between two
+//! tests.
 
-use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, Vector3};
-use rapier3d::dynamics::{MassProperties, RigidBodyBuilder, RigidBodyHandle};
-use rapier3d::math::{Pose, Rotation, Vector};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rapier3d::math::{Pose, Rotation};
+use rapier3d::parry::bounding_volume::Aabb;
 use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
 use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
-use rapier3d::pipeline::PhysicsWorld;
 
-use crate::course::{Course, Mesh, SurfaceKind};
-use crate::vehicle::{Actuation, BodyProperties, GRAVITY_MPS2, VehicleState};
+use crate::body::{Body, glam};
+use crate::course::{Course, Mesh, SurfaceKind, Wall};
+use crate::vehicle::{Actuation, BodyProperties, VehicleState};
 
 /// Contact of the body with the course.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,19 +27,28 @@ pub(crate) enum Contact {
     EndWall,
 }
 
+/// A wall that the body may touch.
+struct WallBody {
+    surfaces: TriMesh,
+    front_m: f32,
+    back_m: f32,
+    /// Middle `[y, z]` of a disc inside the opening.
+    free_middle_m: [f32; 2],
+    free_radius_m: f32,
+}
+
 /// The vehicle's body in the course.
 pub(crate) struct World {
-    obstacles: TriMesh,
-    /// The walls one by one, in course order: parts of `obstacles`.
-    walls: Vec<TriMesh>,
-    end_wall_m: f32,
+    /// The corridor's inside.
+    interior: Aabb,
+    /// The walls in course order.
+    walls: Vec<WallBody>,
     body_shape: Cuboid,
     nominal: BodyProperties,
-    /// Mass of the body in the current episode, kg.
-    mass_kg: f32,
     dt_secs: f32,
-    physics: PhysicsWorld,
-    body: RigidBodyHandle,
+    body: Body,
+    /// Bounds of the body at its pose.
+    bounds: Aabb,
 }
 
 impl World {
@@ -49,103 +56,67 @@ impl World {
     /// physics step takes `dt_secs`.
     ///
     /// # Errors
-    /// parry's reason if the course's surfaces, or those of one wall, form no triangle mesh. Such a
-    /// wall would be air.
+    /// parry's reason if the surfaces of a wall form no triangle mesh. Such a wall would be air.
     pub(crate) fn new(
         course: &Course,
         properties: BodyProperties,
         dt_secs: f32,
     ) -> Result<Self, TriMeshBuilderError> {
-        let (physics, body) = pristine_physics(&properties, dt_secs, &Point3::origin());
-        let (obstacles, walls) = collision_meshes(&course.mesh(), course.walls().len())?;
+        let mesh = course.mesh();
+        let body = Body::at_rest(&properties, &Point3::origin(), dt_secs);
+        let body_shape = Cuboid::new(glam(&properties.half_extents_m));
         Ok(Self {
-            obstacles,
-            walls,
-            end_wall_m: course.corridor().length_m,
-            body_shape: Cuboid::new(glam(&properties.half_extents_m)),
+            interior: interior(&mesh),
+            walls: wall_bodies(&mesh, course)?,
+            bounds: body_shape.compute_aabb(body.pose()),
+            body_shape,
             nominal: properties,
-            mass_kg: properties.mass_kg,
             dt_secs,
-            physics,
             body,
         })
     }
 
-    /// Puts the body at rest at `position_m`, with `mass_factor` times its nominal mass.
-    ///
-    /// Rebuilds the physics, so that nothing of an earlier episode remains in rapier's caches: an
+    /// Puts a new body at rest at `position_m`, with `mass_factor` times the nominal mass: an
     /// episode depends on its start and actions alone.
     pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
-        let body = self.nominal.scaled(mass_factor);
-        self.mass_kg = body.mass_kg;
-        (self.physics, self.body) = pristine_physics(&body, self.dt_secs, position_m);
+        let properties = self.nominal.scaled(mass_factor);
+        self.body = Body::at_rest(&properties, position_m, self.dt_secs);
+        self.bounds = self.body_shape.compute_aabb(self.body.pose());
     }
 
     /// Integrates one physics step under `actuation` and the gust force `gust_n` (world frame, N).
     /// If the state is no longer finite, [`World::is_quarantined`] returns `true`.
     pub(crate) fn advance(&mut self, actuation: &Actuation, gust_n: Option<Vector3<f32>>) {
-        let body = &mut self.physics.bodies[self.body];
-        match actuation {
-            Actuation::Wrench { force_n, torque_nm } => {
-                body.reset_forces(false);
-                body.reset_torques(false);
-                let weight_n = Vector3::z() * (self.mass_kg * GRAVITY_MPS2);
-                body.add_force(glam(&(force_n - weight_n)), true);
-                if let Some(gust_n) = gust_n {
-                    body.add_force(glam(&gust_n), true);
-                }
-                body.add_torque(glam(torque_nm), true);
-            }
-            Actuation::Velocity(velocity_mps) => body.set_linvel(glam(velocity_mps), true),
-        }
-        self.physics.step();
+        self.body.advance(actuation, gust_n);
+        self.bounds = self.body_shape.compute_aabb(self.body.pose());
     }
 
     /// Returns the body's pose and motion.
     pub(crate) fn state(&self) -> VehicleState {
-        let body = &self.physics.bodies[self.body];
-        let rotation = body.rotation();
-        let world_from_body = UnitQuaternion::from_quaternion(Quaternion::new(
-            rotation.w, rotation.x, rotation.y, rotation.z,
-        ));
-        VehicleState {
-            position_m: Point3::from(nalgebra(body.translation())),
-            world_from_body,
-            velocity_mps: nalgebra(body.linvel()),
-            body_rates_radps: world_from_body.inverse_transform_vector(&nalgebra(body.angvel())),
-        }
+        self.body.state()
     }
 
-    /// Returns the position of the body's centre along the corridor, m.
-    pub(crate) fn position_x_m(&self) -> f32 {
-        self.physics.bodies[self.body].translation().x
+    /// Returns the position of the body's rearmost point along the corridor, m.
+    pub(crate) fn tail_x_m(&self) -> f32 {
+        self.bounds.mins.x
     }
 
-    /// Returns `true` if rapier found a pose or velocity that is not finite in the last step and
-    /// switched the body off.
+    /// Returns `true` if a pose or velocity was not finite in the last step.
     pub(crate) fn is_quarantined(&self) -> bool {
-        !self.physics.quarantine().is_empty()
+        self.body.is_quarantined()
     }
 
     /// Returns the wall that the body touches, by its place in course order from 0.
     pub(crate) fn touched_wall(&self) -> Option<usize> {
-        self.walls.iter().position(|wall| self.touches(wall))
+        let (pose, bounds) = (self.body.pose(), &self.bounds);
+        self.walls
+            .iter()
+            .position(|wall| self.touches(pose, bounds, wall))
     }
 
     /// Returns what the body touches.
     pub(crate) fn contact(&self) -> Contact {
-        let world_from_body = self.physics.bodies[self.body].position();
-        let touches_obstacle = self.touches(&self.obstacles);
-        // The end wall fills the whole cross-section: a body that touches nothing else meets it
-        // like a plane.
-        let past_end_wall = self.body_shape.compute_aabb(world_from_body).maxs.x >= self.end_wall_m;
-        if touches_obstacle {
-            Contact::Obstacle
-        } else if past_end_wall {
-            Contact::EndWall
-        } else {
-            Contact::Nothing
-        }
+        self.contact_at(self.body.pose(), &self.bounds)
     }
 
     /// Returns `true` if a body at `world_from_body` would touch no obstacle.
@@ -153,82 +124,106 @@ impl World {
         let [x, y, z, w] = world_from_body.rotation.coords.into();
         let rotation = Rotation::from_xyzw(x, y, z, w);
         let pose = Pose::from_parts(glam(&world_from_body.translation.vector), rotation);
-        !self.touches_from(&pose, &self.obstacles)
+        self.contact_at(&pose, &self.body_shape.compute_aabb(&pose)) != Contact::Obstacle
     }
 
-    fn touches(&self, surfaces: &TriMesh) -> bool {
-        self.touches_from(self.physics.bodies[self.body].position(), surfaces)
+    /// Returns what a body of these `bounds` touches at `world_from_body`.
+    fn contact_at(&self, world_from_body: &Pose, bounds: &Aabb) -> Contact {
+        let inside = &self.interior;
+        let touches_corridor = bounds.mins.cmple(inside.mins).any()
+            || bounds.maxs.y >= inside.maxs.y
+            || bounds.maxs.z >= inside.maxs.z;
+        let mut walls = self.walls.iter();
+        if touches_corridor || walls.any(|wall| self.touches(world_from_body, bounds, wall)) {
+            Contact::Obstacle
+        } else if bounds.maxs.x >= inside.maxs.x {
+            Contact::EndWall
+        } else {
+            Contact::Nothing
+        }
     }
 
-    fn touches_from(&self, world_from_body: &Pose, surfaces: &TriMesh) -> bool {
+    fn touches(&self, world_from_body: &Pose, bounds: &Aabb, wall: &WallBody) -> bool {
+        if !wall.is_near(bounds) {
+            return false;
+        }
         DefaultQueryDispatcher
-            .intersection_test(&world_from_body.inverse(), &self.body_shape, surfaces)
+            .intersection_test(&world_from_body.inverse(), &self.body_shape, &wall.surfaces)
             // Fails for unsupported shapes alone. A failure must never mean "no contact".
             .expect("parry tests a cuboid against a triangle mesh")
             .intersecting
     }
 }
 
-/// Returns a rapier world that holds only the body, at rest at `position_m`.
-fn pristine_physics(
-    properties: &BodyProperties,
-    dt_secs: f32,
-    position_m: &Point3<f32>,
-) -> (PhysicsWorld, RigidBodyHandle) {
-    let mut physics = PhysicsWorld::new();
-    // `advance` adds the weight as a force, because the point drone has none.
-    physics.gravity = Vector::ZERO;
-    physics.integration_parameters.dt = dt_secs;
-    // Solver iterations serve contacts and joints, and there are none.
-    physics.integration_parameters.num_solver_iterations = 1;
-    let mass = MassProperties::new(
-        Vector::ZERO,
-        properties.mass_kg,
-        glam(&properties.inertia_kgm2),
-    );
-    let body = RigidBodyBuilder::dynamic()
-        .translation(glam(&position_m.coords))
-        .additional_mass_properties(mass)
-        .gyroscopic_forces_enabled(true)
-        .can_sleep(false);
-    let body = physics.insert_body(body);
-    (physics, body)
+impl WallBody {
+    /// Returns `false` if a body within `bounds` cannot touch the wall.
+    fn is_near(&self, bounds: &Aabb) -> bool {
+        if bounds.maxs.x < self.front_m || bounds.mins.x > self.back_m {
+            return false;
+        }
+        let [y_m, z_m] = self.free_middle_m;
+        let off_m = |least: f32, most: f32, middle: f32| (most - middle).max(middle - least);
+        let beside_m = off_m(bounds.mins.y, bounds.maxs.y, y_m);
+        let above_m = off_m(bounds.mins.z, bounds.maxs.z, z_m);
+        beside_m * beside_m + above_m * above_m >= self.free_radius_m * self.free_radius_m
+    }
 }
 
-/// Returns the triangles of all obstacles, and those of each of the `walls` walls.
-fn collision_meshes(
-    mesh: &Mesh,
-    walls: usize,
-) -> Result<(TriMesh, Vec<TriMesh>), TriMeshBuilderError> {
-    let vertices: Vec<Vector> = mesh
-        .vertices
+/// Returns the box whose sides are the corridor's surfaces and the end wall.
+fn interior(mesh: &Mesh) -> Aabb {
+    let surfaces = mesh
+        .surfaces
         .iter()
-        .map(|vertex| glam(&vertex.coords))
-        .collect();
+        .filter(|surface| !matches!(surface.kind, SurfaceKind::Wall(_)));
+    let vertices = surfaces.flat_map(|surface| surface.loops.iter().flatten());
+    Aabb::from_points(vertices.map(|&vertex| glam(&mesh.vertices[vertex as usize].coords)))
+}
+
+/// Returns the walls of `course` with their triangles.
+fn wall_bodies(mesh: &Mesh, course: &Course) -> Result<Vec<WallBody>, TriMeshBuilderError> {
+    /// Rounding must not make the free disc reach into the wall.
+    const MARGIN_M: f32 = 1e-3;
+
     let triangles = mesh.triangles();
-    let of = |wanted: &dyn Fn(SurfaceKind) -> bool| {
-        let chosen = triangles
-            .iter()
-            .filter(|&&(_, surface)| wanted(mesh.surfaces[surface].kind))
-            .map(|&(triangle, _)| triangle)
-            .collect();
-        TriMesh::new(vertices.clone(), chosen)
+    let of_wall = |(place, wall): (usize, &Wall)| {
+        let is_of_wall = |surface: usize| mesh.surfaces[surface].kind == SurfaceKind::Wall(place);
+        let chosen = triangles.iter().filter(|(_, surface)| is_of_wall(*surface));
+        Ok(WallBody {
+            surfaces: triangle_mesh(mesh, chosen.map(|(triangle, _)| *triangle).collect())?,
+            front_m: wall.x_m(),
+            back_m: wall.x_m() + course.wall_thickness_m(),
+            free_middle_m: wall.safe_point(),
+            free_radius_m: wall.clearance_m() - MARGIN_M,
+        })
     };
-    let obstacles = of(&|kind| kind != SurfaceKind::EndWall)?;
-    let walls = (0..walls).map(|place| of(&|kind| kind == SurfaceKind::Wall(place)));
-    Ok((obstacles, walls.collect::<Result<_, _>>()?))
+    course.walls().iter().enumerate().map(of_wall).collect()
 }
 
-fn glam(v: &Vector3<f32>) -> Vector {
-    Vector::new(v.x, v.y, v.z)
-}
-
-fn nalgebra(v: Vector) -> Vector3<f32> {
-    Vector3::new(v.x, v.y, v.z)
+/// Returns `triangles` as a mesh, with their own vertices alone.
+fn triangle_mesh(
+    mesh: &Mesh,
+    mut triangles: Vec<[u32; 3]>,
+) -> Result<TriMesh, TriMeshBuilderError> {
+    let used = triangles.iter().flatten().copied();
+    let first = used.clone().min().unwrap_or(0);
+    let end = used.max().map_or(0, |last| last + 1);
+    for corner in triangles.iter_mut().flatten() {
+        *corner -= first;
+    }
+    let vertices = &mesh.vertices[first as usize..end as usize];
+    TriMesh::new(
+        vertices.iter().map(|vertex| glam(&vertex.coords)).collect(),
+        triangles,
+    )
 }
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+    use rapier3d::glamx::EulerRot;
+    use rapier3d::math::{Pose, Rotation, Vector};
+
     use super::*;
     use crate::course::test_course;
 
@@ -242,6 +237,14 @@ mod tests {
         let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
         world.reset(&position_m, 1.0);
         world
+    }
+
+    impl World {
+        /// Moves the body.
+        fn put(&mut self, pose: Pose) {
+            self.body.put(pose);
+            self.bounds = self.body_shape.compute_aabb(self.body.pose());
+        }
     }
 
     fn push(world: &mut World, force_n: Vector3<f32>, torque_nm: Vector3<f32>, secs: f32) {
@@ -346,6 +349,21 @@ mod tests {
     }
 
     #[test]
+    fn the_tail_is_the_turned_bodys_rearmost_point() {
+        let mut world = world_at(Point3::new(5.0, 0.0, 3.5));
+        assert!((world.tail_x_m() - 4.5).abs() < 1e-6);
+        push(
+            &mut world,
+            Vector3::z() * 2.0 * 9.81,
+            Vector3::y() * 0.1,
+            0.32,
+        );
+        let (_, pitch_rad, _) = world.state().world_from_body.euler_angles();
+        let half_m = 0.5 * pitch_rad.cos() + 0.1 * pitch_rad.sin();
+        assert!(pitch_rad > 0.2 && (world.tail_x_m() - (5.0 - half_m)).abs() < 1e-4);
+    }
+
+    #[test]
     fn opening_is_free_and_its_edge_is_not() {
         let course = test_course();
         let wall = &course.walls()[0];
@@ -371,11 +389,46 @@ mod tests {
     #[test]
     fn a_course_with_a_wall_that_nothing_could_touch_is_refused() {
         let course = test_course();
-        let (mut mesh, walls) = (course.mesh(), course.walls().len());
-        assert!(collision_meshes(&mesh, walls).is_ok());
-        let last = SurfaceKind::Wall(walls - 1);
+        let mut mesh = course.mesh();
+        assert!(wall_bodies(&mesh, &course).is_ok());
+        let last = SurfaceKind::Wall(course.walls().len() - 1);
         mesh.surfaces.retain(|surface| surface.kind != last);
-        assert!(collision_meshes(&mesh, walls).is_err());
+        assert!(wall_bodies(&mesh, &course).is_err());
+    }
+
+    #[test]
+    fn contact_equals_that_with_every_triangle_of_the_course() {
+        let course = test_course();
+        let mesh = course.mesh();
+        let is_obstacle = |surface: usize| mesh.surfaces[surface].kind != SurfaceKind::EndWall;
+        let triangles = mesh.triangles().into_iter();
+        let obstacles = triangles.filter(|(_, surface)| is_obstacle(*surface));
+        let obstacles = triangle_mesh(&mesh, obstacles.map(|(triangle, _)| triangle).collect());
+        let obstacles = obstacles.unwrap();
+
+        let mut world = world_at(Point3::origin());
+        let mut rng = Pcg64Mcg::seed_from_u64(1);
+        let mut touched = 0;
+        for number in 0..20_000 {
+            // Every other pose is near a wall. None reaches through the end wall.
+            let x_m = if number % 2 == 0 {
+                rng.random_range(0.3..=59.35)
+            } else {
+                10.0 * rng.random_range(1.0_f32..=5.0).round() + rng.random_range(-0.7..=1.0)
+            };
+            let (y_m, z_m) = (rng.random_range(-2.9..=2.9), rng.random_range(0.1..=6.9));
+            let mut turn = |most: f32| rng.random_range(-most..=most);
+            let turn = Rotation::from_euler(EulerRot::XYZ, turn(0.6), turn(0.6), turn(3.0));
+            let pose = Pose::from_parts(Vector::new(x_m, y_m, z_m), turn);
+            world.put(pose);
+            let expected = DefaultQueryDispatcher
+                .intersection_test(&pose.inverse(), &world.body_shape, &obstacles)
+                .unwrap()
+                .intersecting;
+            touched += u32::from(expected);
+            assert_eq!(world.contact() == Contact::Obstacle, expected, "{pose:?}");
+        }
+        assert!((2000..18_000).contains(&touched), "{touched}");
     }
 
     #[test]

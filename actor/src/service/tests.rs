@@ -84,6 +84,7 @@ impl Run {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: 6,
+            teacher_share: None,
             segment: None,
         }
     }

@@ -20,8 +20,9 @@ use serde::Serialize;
 use skein_kernels::Isa;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::files::destination;
 use skein_protocol::snapshot::Snapshot;
-use skein_reports::MOST_DRAWN;
+use skein_reports::{MOST_DRAWN, unfinished_picture};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
 use skein_rollout::recording::{
@@ -149,14 +150,20 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         keep,
     };
     note!(
-        "snapshot {} of {}: {}, {} threads",
+        "snapshot {} of {}: {}, {}",
         snapshot.version,
         path.display(),
         describe_episodes(
-            &courses,
-            arguments.suite.as_ref().map_or("courses", |_| "entries")
+            &courses
+                .evaluation()
+                .map(|entry| entry.episodes)
+                .collect::<Vec<_>>(),
+            match arguments.suite {
+                Some(_) => ["entry", "entries"],
+                None => ["course", "courses"],
+            }
         ),
-        evaluation.threads()
+        plural(evaluation.threads() as u64, ["thread", "threads"])
     );
     note!(
         "networks are computed with {}; images are drawn with {}",
@@ -193,7 +200,11 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
     written?;
     recorded?;
-    Ok(drawn?)
+    drawn?;
+    if let Some(file) = &arguments.plot {
+        note!("plot: {}", file.display());
+    }
+    Ok(())
 }
 
 fn write_json(file: &Path, report: &WrittenReport<'_>) -> anyhow::Result<()> {
@@ -233,6 +244,10 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
             "the unfinished file of --record",
             arguments.record.as_deref().map(temporary_path),
         ),
+        (
+            "the unfinished file of --plot",
+            arguments.plot.as_deref().map(unfinished_picture),
+        ),
     ];
     let outputs: Vec<_> = outputs
         .into_iter()
@@ -270,15 +285,8 @@ fn is_same_file(one: &Path, other: &Path) -> bool {
             one.is_file() && (one.dev(), one.ino()) == (other.dev(), other.ino())
         }
         (Err(_), Err(_)) => {
-            let place = |path: &Path| {
-                let folder = std::path::absolute(path)
-                    .ok()?
-                    .parent()?
-                    .canonicalize()
-                    .ok()?;
-                Some(folder.join(path.file_name()?))
-            };
-            place(one).is_some_and(|place_of_one| Some(place_of_one) == place(other))
+            let place = destination(one);
+            place.is_some() && place == destination(other)
         }
         _ => false,
     }
@@ -332,12 +340,13 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
     let directory = RunDirectory::new(run);
     // For a run with an identity, this checks that its courses are those it was trained and
     // evaluated on.
-    if directory.identity().is_file() {
+    if directory.identity().exists() {
         directory.open()?;
     }
-    let candidates = [directory.best_snapshot(), directory.latest_snapshot()];
-    let found = candidates.iter().find(|path| path.is_file()).cloned();
-    found.with_context(|| {
+    // A best snapshot that cannot be read is an error: the latest is another policy.
+    let is_there = |path: &PathBuf| fs::symlink_metadata(path).is_ok();
+    let mut candidates = [directory.best_snapshot(), directory.latest_snapshot()].into_iter();
+    candidates.find(is_there).with_context(|| {
         format!(
             "{} holds neither snapshots/best.safetensors nor snapshots/latest.safetensors: is it \
             the directory of a run whose first epoch has ended?",
@@ -360,17 +369,26 @@ fn courses(arguments: &Arguments, config: &Config, snapshot: &Path) -> anyhow::R
     })
 }
 
-/// Describes the episodes; `entries` is the word for what has a number of episodes.
-fn describe_episodes(courses: &Courses, entries: &str) -> String {
-    let episodes: Vec<u64> = courses.evaluation().map(|entry| entry.episodes).collect();
-    match episodes.as_slice() {
+/// Returns `count` with the word for one or for more.
+fn plural(count: u64, [one, more]: [&str; 2]) -> String {
+    format!("{count} {}", if count == 1 { one } else { more })
+}
+
+/// Describes episodes by their number per course or entry of a suite; `entries` is the word for one
+/// of these and for more.
+fn describe_episodes(episodes: &[u64], entries: [&str; 2]) -> String {
+    match episodes {
         [first, others @ ..] if others.iter().all(|episodes| episodes == first) => {
-            format!("{first} episodes on each of {} {entries}", episodes.len())
+            let flown = plural(*first, ["episode", "episodes"]);
+            match episodes.len() {
+                1 => format!("{flown} on 1 {}", entries[0]),
+                count => format!("{flown} on each of {count} {}", entries[1]),
+            }
         }
         _ => format!(
-            "{} episodes in {} {entries}",
-            episodes.iter().sum::<u64>(),
-            episodes.len()
+            "{} in {}",
+            plural(episodes.iter().sum(), ["episode", "episodes"]),
+            plural(episodes.len() as u64, entries)
         ),
     }
 }
@@ -448,4 +466,18 @@ fn columns_help() -> String {
         Exit status: 0 flown, 1 failed, 2 wrong arguments.",
         lines.join("\n")
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_flown_is_described_in_singular_and_plural() {
+        let described = |episodes: &[u64]| describe_episodes(episodes, ["entry", "entries"]);
+        assert_eq!(described(&[1]), "1 episode on 1 entry");
+        assert_eq!(described(&[20]), "20 episodes on 1 entry");
+        assert_eq!(described(&[1, 1]), "1 episode on each of 2 entries");
+        assert_eq!(described(&[20, 1]), "21 episodes in 2 entries");
+    }
 }

@@ -6,8 +6,10 @@ use clap::Parser;
 use skein_evaluate::{Arguments, run};
 use skein_run::failure::with_causes;
 use skein_run::note;
+use skein_run::signals::survive_file_size_limit;
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

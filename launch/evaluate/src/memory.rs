@@ -3,6 +3,7 @@
 use std::fs;
 
 use skein_protocol::transition::TransitionRecord;
+use skein_run::control_groups::{MemoryGroup, memory_groups};
 
 const GIB: f64 = (1u64 << 30) as f64;
 
@@ -47,17 +48,14 @@ pub(crate) fn check_recording(
     }
 }
 
-/// Returns the bytes of memory that this process may still take: those of the machine, or of its
-/// control group if this has a lower limit. `None` if neither is known.
+/// Returns the bytes of memory that this process may still take: those of the machine, or of the
+/// control group that leaves it least. `None` if neither is known.
 pub(crate) fn free_memory() -> Option<u64> {
-    let read = |path: &str| fs::read_to_string(path).ok();
-    let machine = read("/proc/meminfo").and_then(|text| available(&text));
-    // In a container, the control group is mounted as the root.
-    let number = |path: &str| read(path)?.trim().parse::<u64>().ok();
-    let limit = number("/sys/fs/cgroup/memory.max");
-    let used = number("/sys/fs/cgroup/memory.current");
-    let group = limit.map(|limit| limit.saturating_sub(used.unwrap_or(0)));
-    machine.into_iter().chain(group).min()
+    let machine = fs::read_to_string("/proc/meminfo").ok();
+    let machine = machine.and_then(|text| available(&text));
+    let groups = memory_groups();
+    let groups = groups.iter().filter_map(MemoryGroup::free);
+    machine.into_iter().chain(groups).min()
 }
 
 /// Returns the bytes in the line `MemAvailable` of `/proc/meminfo`.

@@ -330,7 +330,21 @@ fn an_output_that_is_another_output_or_an_input_is_refused() {
     let content = std::fs::read(at.join(snapshot)).unwrap();
     std::fs::hard_link(at.join(snapshot), at.join("linked")).unwrap();
     std::fs::create_dir(at.join("folder")).unwrap();
+    for (link, target) in [
+        ("one", "folder/new"),
+        ("two", "three"),
+        ("three", "folder/new"),
+    ] {
+        std::os::unix::fs::symlink(target, at.join(link)).unwrap();
+    }
     for (outputs, other) in [
+        // Both lead to a file that does not exist yet.
+        (vec!["--json", "one", "--plot", "two"], "--plot"),
+        (vec!["--json", "one", "--record", "folder/new"], "--record"),
+        (
+            vec!["--json", "a.png.partial", "--plot", "a.png"],
+            "unfinished",
+        ),
         (
             vec!["--json", "a.npz", "--record", "folder/../a.npz"],
             "--record",
@@ -504,4 +518,55 @@ fn help_documents_the_recording() {
     for word in ["reward_terms", "course_names", "[n, 72, 128]"] {
         assert!(help.contains(word), "{help}");
     }
+}
+
+#[test]
+fn a_write_beyond_the_limit_of_file_sizes_is_an_error_with_its_remedy() {
+    let folder = run_folder();
+    let arguments = "--run . --episodes 1 --threads 1 --record r.npz";
+    let program = env!("CARGO_BIN_EXE_skein-evaluate");
+    let output = Command::new("sh")
+        .args(["-c", &format!("ulimit -f 8; exec {program} {arguments}")])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    for part in ["r.npz", "File too large", "ulimit -f"] {
+        assert!(said.contains(part), "{part} is missing in {said}");
+    }
+    let left = std::fs::read_dir(folder.path()).unwrap();
+    assert_eq!(left.count(), 2, "the snapshots and the courses");
+}
+
+#[test]
+fn a_result_that_cannot_be_written_costs_no_other_and_the_first_is_named() {
+    let folder = run_folder();
+    let at = folder.path();
+    // In the place of the unfinished picture: writing fails at the end, after the checks.
+    std::fs::create_dir(at.join("p.png.partial")).unwrap();
+    let fly = |json: &str| {
+        let arguments = [
+            "--run",
+            ".",
+            "--episodes",
+            "1",
+            "--plot",
+            "p.png",
+            "--json",
+            json,
+        ];
+        let output = evaluate(at, &arguments);
+        assert_eq!(output.status.code(), Some(1), "{output:?}");
+        let table = String::from_utf8(output.stdout).unwrap();
+        assert!(table.contains("non-rectangular"), "{table}");
+        let said = String::from_utf8(output.stderr).unwrap();
+        said.lines().last().unwrap().to_owned()
+    };
+    let said = fly("r.json");
+    assert!(said.contains("cannot write p.png"), "{said}");
+    let report = std::fs::read(at.join("r.json")).unwrap();
+    serde_json::from_slice::<EvaluationReport>(&report).unwrap();
+    let said = fly("/dev/full");
+    assert!(said.contains("cannot write /dev/full"), "{said}");
 }

@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
+use skein_protocol::files::{self, TENSOR_BYTES};
 use skein_protocol::summary::RunEnding;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
@@ -272,7 +273,8 @@ fn differences(run: &RunDirectory, expected: &Config) -> Result<Vec<String>, Str
     let mut changed = Vec::new();
     for (here, there) in expected.files_mut().zip(stored.files_mut()) {
         // The copy may have another name, because two course files had the same name.
-        match fs::read(&here).ok() == fs::read(&there).ok() {
+        let content = |path: &Path| files::read(path, TENSOR_BYTES).ok();
+        match content(here) == content(there) {
             true => here.clone_from(there),
             false => changed.push(format!("{} has changed since", here.display())),
         }

@@ -1,18 +1,18 @@
 //! Results of an experiment's runs, read from their directories.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::files::{self, REPORT_BYTES};
 use skein_protocol::summary::RunSummary;
 
 use super::definition::{Axis, Measure};
 use super::plan::{ExperimentPlan, PlannedRun, RunState};
 use super::statistics::{dispersion_across_time, drawdowns, level, volatility};
-use skein_reports::ReportError;
 use skein_reports::curves::{PlottedEpisode, read_episodes, trailing_mean};
+use skein_reports::{ReportError, TornRow};
 
 /// A complete run.
 #[derive(Debug)]
@@ -53,20 +53,28 @@ pub enum ResultError {
         problem: String,
     },
     /// The file of its episodes cannot be read.
-    #[error(transparent)]
+    #[error("{0}; to train the run again, move its directory away")]
     Episodes(#[from] ReportError),
+    /// The file of its episodes lacks a part of its last row.
+    #[error(
+        "{}: its last row is cut off; to train the run again, move its directory away",
+        .0.path.display()
+    )]
+    Torn(TornRow),
 }
 
-/// Reads the complete runs of `plan`, in its order.
-///
-/// # Errors
-/// [`ResultError`] names the file.
-pub fn read(plan: &ExperimentPlan) -> Result<Vec<RunResult>, ResultError> {
-    plan.runs
-        .iter()
-        .filter(|run| run.state == RunState::Complete)
-        .map(|run| RunResult::trained(run)?.with_suite(run))
-        .collect()
+/// Reads the complete runs of `plan`, in its order. Also returns a [`ResultError`] for each run
+/// whose files are invalid; the others are read nevertheless.
+pub fn read(plan: &ExperimentPlan) -> (Vec<RunResult>, Vec<ResultError>) {
+    let (mut results, mut failures) = (Vec::new(), Vec::new());
+    let complete = |run: &&PlannedRun| run.state == RunState::Complete;
+    for run in plan.runs.iter().filter(complete) {
+        match RunResult::trained(run).and_then(|result| result.with_suite(run)) {
+            Ok(result) => results.push(result),
+            Err(error) => failures.push(error),
+        }
+    }
+    (results, failures)
 }
 
 impl RunResult {
@@ -77,13 +85,17 @@ impl RunResult {
             learning,
             ..
         } = &run.config;
+        let (episodes, torn) = read_episodes(&run.directory.episodes_csv())?;
+        if let Some(torn) = torn {
+            return Err(ResultError::Torn(torn));
+        }
         Ok(Self {
             arm: run.arm,
             seed: run.seed,
             summary: of_training(&run.directory.summary_json())?,
             evaluation: of_training(&run.directory.evaluation_json())?,
             suite: None,
-            episodes: read_episodes(&run.directory.episodes_csv())?,
+            episodes,
             window: evaluation.window_episodes as usize,
             warmup_steps: learning.warmup_steps as u64,
         })
@@ -207,6 +219,6 @@ pub(super) fn of_suite(path: &Path) -> Result<EvaluationReport, ResultError> {
 }
 
 fn json<T: DeserializeOwned>(path: &Path) -> Result<T, String> {
-    let bytes = fs::read(path).map_err(|error| error.to_string())?;
+    let bytes = files::read(path, REPORT_BYTES).map_err(|error| error.to_string())?;
     serde_json::from_slice(&bytes).map_err(|error| error.to_string())
 }

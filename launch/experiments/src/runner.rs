@@ -14,6 +14,7 @@ use std::process::{self, Stdio};
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
+use skein_protocol::files::{self, TABLE_BYTES};
 use skein_run::RunDirectory;
 use skein_run::durable;
 use skein_run::failure::EXIT_INTERRUPTED;
@@ -397,7 +398,7 @@ impl RunTally {
 /// Returns the walls passed in each episode learned from so far. A row that is still being written
 /// is left out.
 fn flown(run: &RunDirectory) -> Vec<f64> {
-    let text = fs::read_to_string(run.episodes_csv()).unwrap_or_default();
+    let text = files::read_text(&run.episodes_csv(), TABLE_BYTES).unwrap_or_default();
     let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
     csv::Reader::from_reader(whole.as_bytes())
         .deserialize()

@@ -8,6 +8,7 @@ use skein_protocol::config::{Config, ConfirmOn, failing_override};
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
+use skein_simulator::text::first_repeated;
 
 use super::PrepareError;
 
@@ -58,29 +59,42 @@ pub fn check(
     check_level_count(
         config_file,
         config,
-        &Course::load(&config.courses.training)?,
+        Course::load(&config.courses.training)?.walls().len(),
         &config.courses.training.display(),
     )?;
     let trains_on_generated = config.courses.generated_share > 0.0;
     if trains_on_generated || config.evaluation.confirm_on == ConfirmOn::Generated {
-        let course =
-            Course::generate(0, &settings.generator).map_err(|source| PrepareError::Ranges {
+        if let Some(shape) = first_repeated(&settings.generator.shapes) {
+            return Err(PrepareError::RepeatedShape {
                 config: in_file(),
-                source,
-            })?;
+                shape: shape.name(),
+            });
+        }
+        let ranges = &settings.generator;
+        ranges.check().map_err(|source| PrepareError::Ranges {
+            config: in_file(),
+            source,
+        })?;
+        let (corridor, start) = ranges.longest();
         settings
-            .check_reach(course.corridor(), course.start())
+            .check_reach(corridor, start)
             .map_err(|source| PrepareError::OutOfReach {
                 config: in_file(),
-                course: "[simulator.generator]".to_owned(),
+                course: match ranges.layout {
+                    Some(_) => "[simulator.generator.layout], the longest course".to_owned(),
+                    None => "[simulator.generator]".to_owned(),
+                },
                 source,
             })?;
         if trains_on_generated {
             check_level_count(
                 config_file,
                 config,
-                &course,
-                &"[simulator.generator] wall_x_m",
+                ranges.most_walls(),
+                &match ranges.layout {
+                    Some(_) => "[simulator.generator] layout.walls",
+                    None => "[simulator.generator] wall_x_m",
+                },
             )?;
         }
     }
@@ -118,15 +132,16 @@ fn check_warmup(config_file: &Path, config: &Config, max_steps: u32) -> Result<(
     })
 }
 
-/// Checks that `course`, called `name` in messages, has all start levels of the training.
+/// Checks that a course with `walls` walls, called `name` in messages, has all start levels of the
+/// training.
 fn check_level_count(
     config_file: &Path,
     config: &Config,
-    course: &Course,
+    walls: usize,
     name: &dyn std::fmt::Display,
 ) -> Result<(), PrepareError> {
-    let (levels, walls) = (config.learning.levels, course.levels());
-    if levels <= walls {
+    let levels = config.learning.levels;
+    if usize::from(levels) <= walls {
         return Ok(());
     }
     Err(PrepareError::TooManyLevels {

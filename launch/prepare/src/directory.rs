@@ -32,9 +32,9 @@ impl NewDirectory {
     /// Creates `directory` unless it exists and is empty. Only its owner can access it afterwards.
     ///
     /// # Errors
-    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::Io`] with the path.
+    /// Returns [`PrepareError::NotEmpty`], or [`PrepareError::RunDirectory`] with the path.
     pub(super) fn make(directory: &Path) -> Result<Self, PrepareError> {
-        let io = |source| PrepareError::Io {
+        let io = |source| PrepareError::RunDirectory {
             path: directory.to_owned(),
             source,
         };
@@ -86,8 +86,8 @@ impl NewDirectory {
     }
 }
 
-/// Copies course files and encoder into the run's directory and makes the configuration refer to the
-/// copies, so that the run stays reproducible when the originals change.
+/// Copies course files and encoder into the run's directory and makes the configuration refer to
+/// the copies, so that the run stays reproducible when the originals change.
 pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let run = RunDirectory::new(root);
     if let Some(encoder) = &mut config.vae.start_from {

@@ -10,7 +10,7 @@ use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::{OutOfReach, SimulatorError};
 
-use super::room::{FoldersTooSmall, SharedMemoryTooSmall};
+use super::room::{FilesTooSmall, FoldersTooSmall, SharedMemoryTooSmall};
 
 /// Reason why a run cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -55,6 +55,17 @@ pub enum PrepareError {
         /// Problem of the ranges.
         #[source]
         source: RangesError,
+    },
+    /// A shape of generated courses is listed twice.
+    #[error(
+        "{}: [simulator.generator] shapes lists {shape:?} twice: name each shape once",
+        config.display()
+    )]
+    RepeatedShape {
+        /// The configuration file.
+        config: PathBuf,
+        /// Name of the shape.
+        shape: &'static str,
     },
     /// No episode can finish a course.
     #[error("{}: {course}: {source}", config.display())]
@@ -114,8 +125,8 @@ pub enum PrepareError {
         levels: u8,
         /// Name of the course, or of the ranges of generated courses.
         course: String,
-        /// Number of its walls.
-        walls: u8,
+        /// Number of its walls, or the most that the ranges allow.
+        walls: usize,
     },
     /// The transport allows fewer actors.
     #[error("{actors} actors are more than transport.max_actors = {max}: start fewer, or raise it")]
@@ -131,6 +142,9 @@ pub enum PrepareError {
     /// The disk has no room for the transport's small files.
     #[error(transparent)]
     Folders(#[from] FoldersTooSmall),
+    /// The limit on the size of a file is too low.
+    #[error(transparent)]
+    FileSize(#[from] FilesTooSmall),
     /// The run's directory is not empty.
     #[error(
         "{} is not empty: choose another --run-dir, \
@@ -139,6 +153,15 @@ pub enum PrepareError {
         quoted(.0)
     )]
     NotEmpty(PathBuf),
+    /// The run's directory cannot be created or used, for example because it is a file.
+    #[error("{}: {source}: name a new or empty directory with --run-dir", path.display())]
+    RunDirectory {
+        /// The directory.
+        path: PathBuf,
+        /// The operating system's error.
+        #[source]
+        source: io::Error,
+    },
     /// A file or folder of the run cannot be written.
     #[error("{}: {source}", path.display())]
     Io {

@@ -48,6 +48,7 @@ pub fn prepare(
     let config = resolve(config_file, overrides, actors)?;
     room::check_shared_memory(&config, actors)?;
     room::check_folders()?;
+    room::check_file_size(&config, actors)?;
     let new = NewDirectory::make(run_directory)?;
     match fill(&new, config) {
         Ok(prepared) => Ok(Prepared {

@@ -162,6 +162,44 @@ pub fn raise_file_limit(actors: usize) -> Result<(), TooFewFiles> {
     }
 }
 
+/// The limit on the size of a file is too low for a run.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "a file may have {} KiB, but the files of this run may grow to {} KiB (checkpoints, shared \
+     memory): raise the limit with ulimit -f {}",
+    limit >> 10,
+    needed.div_ceil(1 << 10),
+    needed.div_ceil(1 << 10)
+)]
+pub struct FilesTooSmall {
+    /// Bytes.
+    needed: u64,
+    /// Bytes.
+    limit: u64,
+}
+
+/// Checks that this process, and so its children, may write the largest file of a run with `config`
+/// and `actors` actors.
+///
+/// # Errors
+/// [`FilesTooSmall`] names the required and the allowed size, and the remedy.
+pub fn check_file_size(config: &Config, actors: usize) -> Result<(), FilesTooSmall> {
+    check_size_within(config, actors, getrlimit(Resource::Fsize).current)
+}
+
+/// `limit`: bytes; `None` is no limit.
+fn check_size_within(
+    config: &Config,
+    actors: usize,
+    limit: Option<u64>,
+) -> Result<(), FilesTooSmall> {
+    let needed = checkpoint_bytes(config).max(shared_memory_needed(config, actors));
+    match limit {
+        Some(limit) if limit < needed => Err(FilesTooSmall { needed, limit }),
+        _ => Ok(()),
+    }
+}
+
 /// Returns the free bytes of shared memory; `None` if unknown.
 pub fn free_shared_memory() -> Option<u64> {
     space(Path::new(SHARED_MEMORY)).map(|space| space.free)
@@ -253,6 +291,19 @@ mod tests {
             "{error:?}"
         );
         for part in ["ulimit -n", "--actors", "open files"] {
+            assert!(error.to_string().contains(part), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_file_size_that_a_run_outgrows_is_refused_with_figures_and_remedy() {
+        let config = Config::default();
+        let checked = |limit| check_size_within(&config, 2, limit);
+        assert_eq!(checked(None), Ok(()));
+        let error = checked(Some(100 << 10)).unwrap_err();
+        assert_eq!(checked(Some(error.needed)), Ok(()));
+        assert!(checked(Some(error.needed - 1)).is_err());
+        for part in ["100 KiB", "ulimit -f", "shared memory"] {
             assert!(error.to_string().contains(part), "{error}");
         }
     }

@@ -181,6 +181,12 @@ fn an_impossible_run_is_refused_before_anything_is_created() {
             vec!["learning.levels = 5", "2 walls", "wall_x_m"],
         ),
         (
+            "[simulator.generator]\nshapes = [\"star\", \"circle\", \"star\"]",
+            "courses.generated_share=0.5",
+            1,
+            vec!["[simulator.generator] shapes", "\"star\" twice"],
+        ),
+        (
             "[simulator.generator]\nclearance_m = [3.4, 3.4]",
             "evaluation.confirm_on=generated",
             1,
@@ -224,6 +230,22 @@ fn an_impossible_run_is_refused_before_anything_is_created() {
             vec!["[simulator.generator]", "corridor.length_m = 100"],
         ),
         (
+            "[simulator.generator.layout]\nwalls = [1, 8]\nspacing_m = [6.0, 15.0]",
+            "courses.generated_share=0.5",
+            1,
+            vec![
+                "[simulator.generator.layout], the longest course",
+                "corridor.length_m = 130",
+                "max_steps to 257 or more",
+            ],
+        ),
+        (
+            "[simulator.generator.layout]\nwalls = [1, 4]",
+            "courses.generated_share=0.5",
+            1,
+            vec!["learning.levels = 5", "4 walls", "layout.walls"],
+        ),
+        (
             "[transport]\nmax_actors = 3",
             "",
             4,
@@ -258,6 +280,14 @@ fn a_used_directory_is_refused_with_a_remedy() {
         error.contains("not empty") && error.contains("--run-dir"),
         "{error}"
     );
+    for directory in [config.clone(), config.join("run")] {
+        let error = prepare(&config, &[], &directory, 1).unwrap_err();
+        let error = error.to_string();
+        assert!(
+            error.contains("test.toml") && error.contains("new or empty directory with --run-dir"),
+            "{error}"
+        );
+    }
 }
 
 #[test]

@@ -12,6 +12,7 @@ use std::sync::Once;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::register_font;
+use skein_protocol::files::destination;
 
 use super::ReportError;
 
@@ -109,8 +110,8 @@ impl Canvas {
     /// # Errors
     /// [`ReportError::Write`] names the file.
     pub(super) fn save(&self, path: &Path) -> Result<(), ReportError> {
-        let target = linked(path);
-        let aside = target.with_extension("png.partial");
+        let target = target(path);
+        let aside = unfinished_picture(path);
         self.write(&aside)
             .and_then(|()| fs::rename(&aside, &target))
             .map_err(|source| {
@@ -157,14 +158,13 @@ impl Canvas {
     }
 }
 
-/// Returns the file to which `path` leads if it is a link, which may not exist yet.
-fn linked(path: &Path) -> PathBuf {
-    let there = fs::read_link(path).map(|target| match path.parent() {
-        Some(folder) => folder.join(target),
-        None => target,
-    });
-    let existing = fs::canonicalize(path).ok();
-    existing.or(there.ok()).unwrap_or_else(|| path.to_owned())
+/// Returns the name under which the picture at `path` is written; links are followed.
+pub fn unfinished_picture(path: &Path) -> PathBuf {
+    target(path).with_extension("png.partial")
+}
+
+fn target(path: &Path) -> PathBuf {
+    destination(path).unwrap_or_else(|| path.to_owned())
 }
 
 fn register_plot_font() {

@@ -6,8 +6,9 @@ use plotters::prelude::*;
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, GRID, INK, REFERENCE, STRONG, font, px};
-use super::curves::{legend_line, padded_range, thick_line};
+use super::curves::{padded_range, thick_line};
 use super::growth::brief;
+use super::head::{LegendEntry, draw_head};
 
 /// Largest number of lines that can be distinguished in one picture.
 pub const MOST_LINES: usize = 8;
@@ -82,8 +83,15 @@ impl Comparison<'_> {
 
     fn draw_lines(&self, area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         let (xs, ys) = self.ranges();
-        let mut chart = ChartBuilder::on(area)
-            .caption(&self.title, font(22))
+        let arms = self.lines.iter().zip(COLOURS);
+        let mut entries: Vec<_> = arms
+            .map(|(line, colour)| LegendEntry::line(line.label, colour))
+            .collect();
+        if let Some((_, label)) = &self.level {
+            entries.push(LegendEntry::line(label, LEVEL));
+        }
+        let below = draw_head(area, &self.title, 22, &entries)?;
+        let mut chart = ChartBuilder::on(&below)
             .margin(px(16))
             .margin_right(px(28))
             .x_label_area_size(px(48))
@@ -111,17 +119,14 @@ impl Comparison<'_> {
                     .map(|corners| Polygon::new(corners, colour.mix(0.16).filled())),
             )?;
         }
-        if let Some((level, label)) = &self.level {
+        if let Some((level, _)) = &self.level {
             let ends = [(0.0, *level), (self.furthest(), *level)];
-            chart
-                .draw_series(DashedLineSeries::new(
-                    ends,
-                    px(8),
-                    px(6),
-                    LEVEL.stroke_width(px(2)),
-                ))?
-                .label(label)
-                .legend(|point| legend_line(point, LEVEL));
+            chart.draw_series(DashedLineSeries::new(
+                ends,
+                px(8),
+                px(6),
+                LEVEL.stroke_width(px(2)),
+            ))?;
         }
         for (line, colour) in self.lines.iter().zip(COLOURS) {
             let points: Vec<_> = line
@@ -129,20 +134,8 @@ impl Comparison<'_> {
                 .iter()
                 .map(|point| (point.x, point.value))
                 .collect();
-            chart
-                .draw_series(thick_line(&points, colour, px(2)))?
-                .label(line.label)
-                .legend(move |point| legend_line(point, colour));
+            chart.draw_series(thick_line(&points, colour, px(2)))?;
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
-            .margin(px(12))
-            .label_font(font(16))
-            .legend_area_size(px(30))
-            .background_style(WHITE.mix(0.85))
-            .border_style(GRID)
-            .draw()?;
         Ok(())
     }
 

@@ -7,6 +7,8 @@ use serde::Deserialize;
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, FAINT, GRID, INK, REFERENCE, STRONG, font, px};
+use super::complete_rows::{TornRow, complete_rows};
+use super::head::{LegendEntry, Mark, draw_head};
 
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 640;
@@ -28,16 +30,17 @@ pub struct PlottedEpisode {
 /// take forever.
 const LARGEST_RETURN: f64 = 1e12;
 
-/// Reads `episodes.csv`.
+/// Reads the complete rows of `episodes.csv`; says so if the last one is cut off.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub fn read_episodes(path: &Path) -> Result<Vec<PlottedEpisode>, ReportError> {
+pub fn read_episodes(path: &Path) -> Result<(Vec<PlottedEpisode>, Option<TornRow>), ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
     };
-    let mut reader = csv::Reader::from_path(path).map_err(|error| malformed(error.to_string()))?;
+    let (text, torn) = complete_rows(path)?;
+    let mut reader = csv::Reader::from_reader(&text[..]);
     // Otherwise an unreadable header would pass for a file without rows.
     reader
         .headers()
@@ -54,7 +57,7 @@ pub fn read_episodes(path: &Path) -> Result<Vec<PlottedEpisode>, ReportError> {
         }
         episodes.push(row);
     }
-    Ok(episodes)
+    Ok((episodes, torn))
 }
 
 /// Draws the return of every episode and its moving average over `window` episodes (paper, figure
@@ -155,8 +158,20 @@ impl EpisodeCurve {
     fn draw(&self, area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         let episodes = self.values.len().max(2);
         let (low, high) = self.range;
-        let mut chart = ChartBuilder::on(area)
-            .caption(&self.title, font(22))
+        let average = format!("average over {} episodes", self.window);
+        let mut entries = vec![LegendEntry::line(&average, STRONG)];
+        if self.raw == RawValues::Shown {
+            entries.push(LegendEntry {
+                label: "one episode",
+                colour: STRONG,
+                mark: Mark::Dot,
+            });
+        }
+        if let Some((_, label)) = &self.level {
+            entries.push(LegendEntry::line(label, REFERENCE));
+        }
+        let below = draw_head(area, &self.title, 22, &entries)?;
+        let mut chart = ChartBuilder::on(&below)
             .margin(px(16))
             .margin_right(px(28))
             .x_label_area_size(px(48))
@@ -179,29 +194,21 @@ impl EpisodeCurve {
 
         let at = |(i, &value): (usize, &f64)| ((i + 1) as f64, value);
         if self.raw == RawValues::Shown {
-            chart
-                .draw_series(
-                    self.values
-                        .iter()
-                        .enumerate()
-                        .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.28).filled())),
-                )?
-                .label("one episode")
-                .legend(|(x, y)| {
-                    Circle::new((x + px(12) as i32, y), px(3), STRONG.mix(0.4).filled())
-                });
+            chart.draw_series(
+                self.values
+                    .iter()
+                    .enumerate()
+                    .map(|point| Circle::new(at(point), px(2), STRONG.mix(0.28).filled())),
+            )?;
         }
-        if let Some((level, label)) = &self.level {
+        if let Some((level, _)) = &self.level {
             let ends = [(1.0, *level), (episodes as f64, *level)];
-            chart
-                .draw_series(DashedLineSeries::new(
-                    ends,
-                    px(8),
-                    px(6),
-                    REFERENCE.stroke_width(px(2)),
-                ))?
-                .label(label)
-                .legend(|point| legend_line(point, REFERENCE));
+            chart.draw_series(DashedLineSeries::new(
+                ends,
+                px(8),
+                px(6),
+                REFERENCE.stroke_width(px(2)),
+            ))?;
         }
         // The average is faint until its window is full: those values are not comparable with the
         // rest.
@@ -209,24 +216,8 @@ impl EpisodeCurve {
         let filling = self.window.min(mean.len());
         let points: Vec<_> = mean.iter().enumerate().map(at).collect();
         chart.draw_series(thick_line(&points[..filling], FAINT, px(2)))?;
-        chart
-            .draw_series(thick_line(
-                &points[filling.saturating_sub(1)..],
-                STRONG,
-                px(2),
-            ))?
-            .label(format!("average over {} episodes", self.window))
-            .legend(|point| legend_line(point, STRONG));
-
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::LowerRight)
-            .margin(px(12))
-            .label_font(font(16))
-            .legend_area_size(px(30))
-            .background_style(WHITE.mix(0.85))
-            .border_style(GRID)
-            .draw()?;
+        let full = &points[filling.saturating_sub(1)..];
+        chart.draw_series(thick_line(full, STRONG, px(2)))?;
         Ok(())
     }
 }
@@ -241,10 +232,6 @@ pub(super) fn thick_line(
     points
         .windows(2)
         .map(move |ends| PathElement::new(ends.to_vec(), colour.stroke_width(width)))
-}
-
-pub(super) fn legend_line((x, y): (i32, i32), colour: RGBColor) -> PathElement<(i32, i32)> {
-    PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3)))
 }
 
 /// Returns the range of the values with a margin, never empty.

@@ -6,6 +6,7 @@ use plotters::prelude::*;
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, GRID, INK, REFERENCE, STRONG, font, px};
+use super::head::{LegendEntry, draw_head};
 
 const WIDTH: u32 = 760;
 const HEIGHT: u32 = 420;
@@ -90,8 +91,12 @@ fn draw_lines(
             .iter()
             .flat_map(|line| line.points.iter().map(|point| point.1)),
     );
-    let mut chart = ChartBuilder::on(area)
-        .caption(growth.title, font(20))
+    let entries: Vec<_> = lines
+        .iter()
+        .map(|line| LegendEntry::line(line.label, line.colour))
+        .collect();
+    let below = draw_head(area, growth.title, 20, &entries)?;
+    let mut chart = ChartBuilder::on(&below)
         .margin(px(14))
         .margin_right(px(26))
         .x_label_area_size(px(46))
@@ -117,29 +122,15 @@ fn draw_lines(
     for line in lines {
         let colour = line.colour;
         let segments = line.points.windows(2);
-        chart
-            .draw_series(
-                segments.map(|ends| PathElement::new(ends.to_vec(), colour.stroke_width(px(2)))),
-            )?
-            .label(line.label)
-            .legend(move |(x, y)| {
-                PathElement::new([(x, y), (x + px(24) as i32, y)], colour.stroke_width(px(3)))
-            });
+        chart.draw_series(
+            segments.map(|ends| PathElement::new(ends.to_vec(), colour.stroke_width(px(2)))),
+        )?;
         chart.draw_series(
             line.points
                 .iter()
                 .map(|&at| Circle::new(at, px(4), colour.filled())),
         )?;
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperLeft)
-        .margin(px(10))
-        .label_font(font(14))
-        .legend_area_size(px(30))
-        .background_style(WHITE.mix(0.85))
-        .border_style(GRID)
-        .draw()?;
     Ok(())
 }
 

@@ -5,10 +5,12 @@
 mod canvas;
 mod clock;
 pub mod comparison;
+mod complete_rows;
 mod courses;
 pub mod curves;
 mod front_views;
 pub mod growth;
+mod head;
 mod reconstructions;
 mod trajectories;
 
@@ -17,7 +19,9 @@ use std::path::{Path, PathBuf};
 
 use skein_run::RunDirectory;
 
+pub use canvas::unfinished_picture;
 pub use clock::Clock;
+pub use complete_rows::TornRow;
 pub use courses::{NamedCourse, ideal_walls_passed, load_courses};
 pub use trajectories::{FlownCourse, MOST_DRAWN, Trajectory, draw_trajectories};
 
@@ -61,25 +65,34 @@ pub struct RunMaterial {
     episodes: Option<Vec<curves::PlottedEpisode>>,
     reconstructions: Option<reconstructions::Pairs>,
     trajectories: Option<trajectories::TrajectoriesByCourse>,
+    torn: Vec<TornRow>,
 }
 
 impl RunMaterial {
     /// Reads all files before anything is drawn. Also returns a [`ReportError`] for each file that
-    /// is invalid; the others are read nevertheless.
+    /// is invalid; the others are read nevertheless. So are the complete rows of a table whose last
+    /// row is cut off.
     pub fn read(run: &RunDirectory) -> (Self, Vec<ReportError>) {
         let mut failures = Vec::new();
+        let episodes = existing(run.episodes_csv(), curves::read_episodes, &mut failures);
+        let reconstructions = existing(
+            run.reconstructions(),
+            reconstructions::Pairs::read,
+            &mut failures,
+        );
+        let trajectories = existing(
+            run.evaluation_trajectories_csv(),
+            trajectories::read_trajectories,
+            &mut failures,
+        );
+        let (episodes, episodes_torn) = episodes.unzip();
+        let (trajectories, trajectories_torn) = trajectories.unzip();
+        let torn = [episodes_torn, trajectories_torn];
         let material = Self {
-            episodes: existing(run.episodes_csv(), curves::read_episodes, &mut failures),
-            reconstructions: existing(
-                run.reconstructions(),
-                reconstructions::Pairs::read,
-                &mut failures,
-            ),
-            trajectories: existing(
-                run.evaluation_trajectories_csv(),
-                trajectories::read_trajectories,
-                &mut failures,
-            ),
+            episodes,
+            reconstructions,
+            trajectories,
+            torn: torn.into_iter().flatten().flatten().collect(),
         };
         (material, failures)
     }
@@ -92,6 +105,8 @@ pub struct DrawnPlots {
     pub pictures: Vec<PathBuf>,
     /// A [`ReportError`] for each file that is invalid and each picture that cannot be written.
     pub failures: Vec<ReportError>,
+    /// Rows that the pictures lack.
+    pub torn: Vec<TornRow>,
 }
 
 /// Draws every plot whose input exists. A run that ended early has fewer. A plot that fails leaves
@@ -110,6 +125,7 @@ pub fn draw_all(
     let mut plots = DrawnPlots {
         pictures: Vec::new(),
         failures,
+        torn: material.torn,
     };
     let mut picture = |name: &str, draw: &dyn Fn(&Path) -> Result<(), ReportError>| {
         let path = run.plots().join(name);
@@ -249,7 +265,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
         write_episodes(&run);
-        fs::write(run.evaluation_trajectories_csv(), b"course\n\xff").unwrap();
+        fs::write(run.evaluation_trajectories_csv(), b"course\n\xff\n").unwrap();
         fs::write(run.reconstructions(), b"{").unwrap();
         // In the place of a picture.
         fs::create_dir_all(run.plots().join("return.png")).unwrap();
@@ -268,6 +284,28 @@ mod tests {
             );
         }
         assert_eq!(failures.len(), 3);
+    }
+
+    #[test]
+    fn a_row_that_is_cut_off_is_named_and_costs_no_picture() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        for (rows, pictures) in [("4,2,1.0\n4,2,1", 2), ("\0\0\0", 0)] {
+            fs::write(
+                run.episodes_csv(),
+                format!("steps,walls_passed,return\n{rows}"),
+            )
+            .unwrap();
+            let plots = draw_all(&run, &[training()], 50, Some(3.0));
+            assert_eq!(plots.pictures.len(), pictures, "{rows:?}");
+            assert!(plots.failures.is_empty(), "{:?}", plots.failures);
+            let [torn] = &plots.torn[..] else {
+                panic!("{rows:?}: nobody says that a row is missing");
+            };
+            assert!(torn.to_string().contains("episodes.csv"), "{torn}");
+        }
+        let (episodes, _) = curves::read_episodes(&run.episodes_csv()).unwrap();
+        assert!(episodes.is_empty());
     }
 
     #[test]
@@ -299,7 +337,7 @@ mod tests {
         );
         fs::remove_file(run.evaluation_trajectories_csv()).unwrap();
         fs::remove_dir(run.episodes_csv()).unwrap();
-        for rows in ["4,2\n", "4,2,inf\n", "4,-1,1\n", "4,2,1.0\n4,2,", "\0\0\0"] {
+        for rows in ["4,2\n", "4,2,inf\n", "4,-1,1\n", "\0\0\0\n"] {
             fs::write(run.episodes_csv(), format!("{header}{rows}")).unwrap();
             let plots = draw_all(&run, &[training()], 50, Some(3.0));
             let [failure] = &plots.failures[..] else {

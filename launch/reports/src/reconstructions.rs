@@ -1,9 +1,9 @@
 //! Depth images beside their reconstructions by the VAE.
 
-use std::fs;
 use std::path::Path;
 
 use safetensors::{Dtype, SafeTensors};
+use skein_protocol::files::{self, TENSOR_BYTES};
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 
 use super::ReportError;
@@ -32,7 +32,7 @@ impl Pairs {
     /// # Errors
     /// [`ReportError`] names the file and its problem.
     pub(super) fn read(path: &Path) -> Result<Self, ReportError> {
-        let bytes = fs::read(path).map_err(|source| ReportError::Read {
+        let bytes = files::read(path, TENSOR_BYTES).map_err(|source| ReportError::Read {
             path: path.to_owned(),
             source,
         })?;
@@ -130,6 +130,8 @@ fn mean_error(depth: &[u8], reconstruction: &[u8]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use std::collections::HashMap;
 
     use safetensors::tensor::TensorView;

@@ -10,6 +10,7 @@ use skein_simulator::course::{Course, Wall};
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px};
+use super::complete_rows::{TornRow, complete_rows};
 use super::front_views::FrontViews;
 use crate::NamedCourse;
 
@@ -72,18 +73,22 @@ struct TrajectoryRow {
     outcome: Outcome,
 }
 
-/// Reads `evaluation_trajectories.csv`. The steps of an episode are consecutive.
+/// Reads the complete rows of `evaluation_trajectories.csv`; says so if the last one is cut off.
+/// The steps of an episode are consecutive.
 ///
 /// # Errors
 /// [`ReportError::Malformed`] names the line.
-pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, ReportError> {
+pub(super) fn read_trajectories(
+    path: &Path,
+) -> Result<(TrajectoriesByCourse, Option<TornRow>), ReportError> {
     let malformed = |problem: String| ReportError::Malformed {
         path: path.to_owned(),
         problem,
     };
     let mut courses = TrajectoriesByCourse::new();
     let mut current = None;
-    let mut reader = csv::Reader::from_path(path).map_err(|error| malformed(error.to_string()))?;
+    let (text, torn) = complete_rows(path)?;
+    let mut reader = csv::Reader::from_reader(&text[..]);
     // Otherwise an unreadable header would pass for a file without rows.
     reader
         .headers()
@@ -114,7 +119,7 @@ pub(super) fn read_trajectories(path: &Path) -> Result<TrajectoriesByCourse, Rep
             episode.points_m.push(at_m);
         }
     }
-    Ok(courses)
+    Ok((courses, torn))
 }
 
 /// Returns the episodes of each course of a run. Courses without episodes are left out.
@@ -465,8 +470,8 @@ fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         (px(LEFT) as i32, y - px(11) as i32),
     )?;
     area.draw_text(
-        "Below each course: its walls as the drone meets them. A dot: the drone's centre crossed \
-         there. A cross: it ended at the wall.",
+        "Below each course, its walls from the front: a dot where the drone's centre crossed the \
+         wall, a cross where it collided within its own width of the wall.",
         &font(15),
         (px(LEFT) as i32, y + px(22) as i32),
     )?;
@@ -503,7 +508,7 @@ mod tests {
         let rows = "course,episode,step,x_m,y_m,z_m,outcome\na,0,0,1,0,3,collided\n\
                     a,0,1,2,0,3,collided\na,1,0,1,0,3,reached_end\nb,1,0,1,0,3,timed_out\n";
         std::fs::write(&path, rows).unwrap();
-        let paths = read_trajectories(&path).unwrap();
+        let (paths, _) = read_trajectories(&path).unwrap();
         let lengths = |name: &str| {
             paths[name]
                 .iter()

@@ -310,3 +310,67 @@ async fn listen(mut lines: Lines<BufReader<ChildStdout>>, events: mpsc::Sender<S
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use rustix::process::Signal;
+    use skein_protocol::config::Config;
+    use skein_run::RunDirectory;
+
+    use super::super::{Deadlines, Programs};
+    use super::*;
+
+    #[tokio::test]
+    async fn a_learner_for_which_memory_ran_out_ten_times_is_given_up() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(folder.path());
+        fs::create_dir(run.logs()).unwrap();
+        let kills = folder.path().join("kills");
+        let count = |kills_so_far: u32| {
+            fs::write(&kills, format!("oom_kill {kills_so_far}\n")).unwrap();
+        };
+        count(0);
+        let memory = MemoryWatch::on(vec![kills.clone()], Vec::new());
+        let plan = SupervisionPlan {
+            run,
+            programs: Programs {
+                learner: Path::new("learner").to_owned(),
+                actor: Path::new("actor").to_owned(),
+            },
+            actors: Vec::new(),
+            learner_threads: 1,
+            deadlines: Deadlines::of(&Config::default()),
+        };
+        let (events, _received) = mpsc::channel(1);
+        let mut learner = LearnerProcess {
+            plan: &plan,
+            events,
+            state: LearnerState::Dead,
+            deaths: LearnerDeaths::new(Duration::ZERO),
+            restarts: 0,
+            memory,
+        };
+        let killed = Exit::Signal(Signal::KILL.as_raw());
+        // A user's kill is no failure, however often it happens.
+        for _ in 0..20 {
+            learner.exited(&killed).unwrap();
+        }
+        for death in 1..LearnerDeaths::MAX_WITHOUT_PROGRESS {
+            count(death);
+            let said = learner.exited(&killed).unwrap();
+            assert!(said.contains("out of memory"), "{said}");
+        }
+        count(LearnerDeaths::MAX_WITHOUT_PROGRESS);
+        let error = learner.exited(&killed).unwrap_err().to_string();
+        for part in [
+            "died 10 times without making progress",
+            "out of memory",
+            "--actors",
+        ] {
+            assert!(error.contains(part), "{part} is missing in {error}");
+        }
+    }
+}

@@ -179,6 +179,7 @@ impl Learner {
             start_level: 1,
             exploration: Exploration::Sample,
             seed: episode,
+            teacher_share: None,
             segment: None,
         };
         let tickets = numbers.clone().map(ticket).collect();

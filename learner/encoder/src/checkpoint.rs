@@ -4,7 +4,6 @@
 //! curve so far, and the configuration in the metadata.
 
 use std::collections::HashMap;
-use std::fs;
 use std::io;
 use std::path::Path;
 
@@ -12,6 +11,7 @@ use anyhow::{Context, Result, ensure};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use skein_learner::state::{NamedTensor, TensorValues};
 use skein_protocol::config::Config;
+use skein_protocol::files::{self, TENSOR_BYTES};
 use skein_run::durable;
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -44,7 +44,7 @@ impl Checkpoint {
     /// # Errors
     /// Names the file, the problem and the remedy.
     pub(crate) fn load(path: &Path, config: &Config) -> Result<Option<Self>> {
-        let read = match fs::read(path) {
+        let read = match files::read(path, TENSOR_BYTES) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             read => read.map_err(anyhow::Error::from),
         };
@@ -123,6 +123,8 @@ impl Checkpoint {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

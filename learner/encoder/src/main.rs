@@ -2,7 +2,7 @@
 
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use clap::Parser;
@@ -14,10 +14,11 @@ use skein_protocol::config::Config;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_run::allocation::keep_freed_memory;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
-use skein_run::signals::is_ignored;
+use skein_run::signals::{is_ignored, survive_file_size_limit};
 use skein_run::{note, show};
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     keep_freed_memory();
     match run(&Arguments::parse()) {
         Ok(status) => status,
@@ -39,7 +40,10 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     }
     let stop = stop_on_signals().context("cannot listen to signals")?;
     let mut training = Training::begin(&config, &settings, arguments.files()?)?;
-    match training.train(&stop)? {
+    stop.store(false, Ordering::Relaxed);
+    let ending = training.train(&stop)?;
+    stop.store(true, Ordering::Relaxed);
+    match ending {
         Ending::Completed => {
             let (encoder, file) = training.finish()?;
             show!("{}", Measurement::of(&encoder, &config, &settings)?);
@@ -54,10 +58,13 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
 }
 
 /// Returns a flag that SIGTERM and SIGINT set, unless they were ignored when this process started.
+/// While it is set, as it is at first, they end the process at once: there is nothing to save.
 fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
+    let stop = Arc::new(AtomicBool::new(true));
     for number in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
         if !is_ignored(number) {
+            let status = EXIT_INTERRUPTED.into();
+            signal_hook::flag::register_conditional_shutdown(number, status, stop.clone())?;
             signal_hook::flag::register(number, stop.clone())?;
         }
     }

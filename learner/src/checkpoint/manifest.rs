@@ -1,10 +1,10 @@
 //! The manifest: lists a checkpoint's files, with sizes and checksums that reveal damage.
 
-use std::fs::{self, File};
 use std::io::{self, BufReader};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::files::{self, REPORT_BYTES};
 use xxhash_rust::xxh3::{Xxh3Default, xxh3_64};
 
 use super::CheckpointError;
@@ -13,7 +13,7 @@ use super::CheckpointError;
 pub(super) const NAME: &str = "manifest.json";
 
 /// Version of the checkpoint format; changes whenever older checkpoints become unreadable.
-pub(super) const FORMAT: u32 = 7;
+pub(super) const FORMAT: u32 = 8;
 
 /// Bytes of a file that are read at once for its checksum.
 const PIECE: usize = 1 << 20;
@@ -78,7 +78,7 @@ impl Manifest {
     /// this format.
     pub(super) fn read(directory: &Path) -> Result<Self, CheckpointError> {
         let path = directory.join(NAME);
-        let bytes = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
+        let bytes = files::read(&path, REPORT_BYTES).map_err(CheckpointError::io("read", &path))?;
         Self::parse(&bytes, &path)
     }
 
@@ -149,7 +149,7 @@ impl Manifest {
                 problem: format!("it does not list {name}"),
             })?;
         let path = directory.join(name);
-        let content = fs::read(&path).map_err(CheckpointError::io("read", &path))?;
+        let content = files::read(&path, u64::MAX).map_err(CheckpointError::io("read", &path))?;
         entry.check(&path, content.len() as u64, &hex(xxh3_64(&content)))?;
         Ok(content)
     }
@@ -161,7 +161,7 @@ impl ManifestEntry {
         let path = directory.join(name);
         // In pieces: depth images can be too large to hold twice in memory.
         let mut hasher = Xxh3Default::new();
-        let bytes = File::open(&path)
+        let bytes = files::open(&path, u64::MAX)
             .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
             .map_err(CheckpointError::io("read", &path))?;
         Ok(Self {

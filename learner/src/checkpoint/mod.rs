@@ -120,7 +120,7 @@ impl TrainingProgress {
 }
 
 /// Order of one epoch's episodes. With configuration and run, it determines their tickets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct EpochOrder {
     /// Epoch.
     pub epoch: u64,
@@ -128,6 +128,8 @@ pub struct EpochOrder {
     pub policy_version: u64,
     /// Exploration of the episodes.
     pub exploration: Exploration,
+    /// Share of the steps that the teacher flies; `None` without a teacher.
+    pub teacher_share: Option<f32>,
     /// Data to keep of the episodes.
     pub keep: KeptData,
 }
@@ -141,6 +143,27 @@ pub struct BestSnapshot {
     pub episodes: u64,
     /// Mean number of walls passed in the training episodes of the window at that time.
     pub window_walls_passed: f64,
+    /// Its confirmation episodes, in order.
+    pub confirmed: Vec<EpisodeWalls>,
+}
+
+/// Walls of an episode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EpisodeWalls {
+    /// Walls passed.
+    pub passed: u8,
+    /// Walls of the course.
+    pub of: u8,
+}
+
+impl BestSnapshot {
     /// Mean number of walls passed in its confirmation episodes.
-    pub confirmed_walls_passed: f64,
+    pub fn confirmed_walls_passed(&self) -> f64 {
+        let passed: u64 = self
+            .confirmed
+            .iter()
+            .map(|walls| u64::from(walls.passed))
+            .sum();
+        passed as f64 / self.confirmed.len() as f64
+    }
 }

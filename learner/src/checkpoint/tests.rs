@@ -53,6 +53,7 @@ fn state(episodes: u64) -> CheckpointState {
                 epoch: 7,
                 policy_version: 6,
                 exploration: Exploration::Sample,
+                teacher_share: Some(0.5),
                 keep: KeptData::Depth,
             }],
             evaluations: 1,
@@ -62,7 +63,7 @@ fn state(episodes: u64) -> CheckpointState {
                 policy_version: 6,
                 episodes: 60,
                 window_walls_passed: 0.1,
-                confirmed_walls_passed: 2.5,
+                confirmed: vec![EpisodeWalls { passed: 2, of: 5 }],
             }),
             trained: Some(skein_protocol::summary::Trained {
                 rate: 0.92,

@@ -181,6 +181,7 @@ impl Assembly {
 
     fn take_step(&mut self, record: &TransitionRecord) {
         self.episode.actions.push(record.action);
+        self.episode.teacher_actions.push(record.teacher_action);
         self.episode.rewards.push(record.reward);
         self.episode.reward_terms.push(record.reward_terms);
         self.episode.level_up.push(record.level_up == 1);
@@ -341,6 +342,7 @@ fn nothing_of(order: &EpisodeOrder, actor: ActorId) -> CommittedEpisode {
         action_before: flown.last().copied().unwrap_or_default(),
         observations: Vec::new(),
         actions: Vec::new(),
+        teacher_actions: Vec::new(),
         rewards: Vec::new(),
         reward_terms: Vec::new(),
         level_up: Vec::new(),

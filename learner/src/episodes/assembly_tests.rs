@@ -25,6 +25,7 @@ fn ticket() -> Ticket {
         start_level: 1,
         exploration: Exploration::Sample,
         seed: 9,
+        teacher_share: None,
         segment: None,
     }
 }

@@ -36,6 +36,7 @@ pub(super) fn order(episode: u64) -> EpisodeOrder {
         start_level: 1,
         exploration: Exploration::Sample,
         seed: episode,
+        teacher_share: None,
         segment: None,
     };
     EpisodeOrder {

@@ -9,6 +9,7 @@ use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::files;
 use skein_protocol::transition::Outcome;
 use xxhash_rust::xxh3::Xxh3Default;
 
@@ -97,7 +98,8 @@ impl EpisodesExtent {
         if self.bytes == 0 {
             return Ok(());
         }
-        let found = match File::open(path).and_then(|file| checksum_of(file, self.bytes)) {
+        let found = match files::open(path, u64::MAX).and_then(|file| checksum_of(file, self.bytes))
+        {
             Ok((bytes, _)) if bytes < self.bytes => {
                 Err(format!("ends after {bytes} bytes of {}", self.bytes))
             }

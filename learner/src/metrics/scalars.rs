@@ -43,6 +43,9 @@ scalars! {
     /// SAC: the policy's entropy in nats, estimated on the minibatches. The temperature steers it
     /// towards the target entropy.
     Entropy => "policy/entropy",
+    /// With a teacher: squared distance between the policy's mode and the teacher's action, summed
+    /// over the action's two numbers.
+    TeacherDistance => "policy/teacher_distance",
     /// Mean of the smaller Q output on the minibatches: the discounted return that the critic
     /// expects, with SAC including the entropy bonus.
     MeanValue => "policy/mean_value",

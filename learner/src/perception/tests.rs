@@ -81,14 +81,11 @@ fn encoder_of(algorithm: &dyn Algorithm, config: &Config) -> Vec<f32> {
 
 #[test]
 fn the_critics_loss_moves_every_tensor_of_the_encoder_and_its_target_follows() {
-    for name in ALGORITHMS {
+    let targets = ["sac.target.parameters", "td3.target_critic.parameters"];
+    for (name, target) in ALGORITHMS.into_iter().zip(targets) {
         let config = config(name);
         let (layout, mut algorithm) = (SnapshotLayout::of(&config), new(&config));
         let encoder = layout.encoder();
-        let target = match name {
-            AlgorithmName::Sac => "sac.target.parameters",
-            AlgorithmName::Td3 => "td3.target_critic.parameters",
-        };
         let (before, target_before) = (
             encoder_of(&*algorithm, &config),
             part(&mut *algorithm, target)[encoder.clone()].to_vec(),

@@ -63,6 +63,8 @@ pub struct Minibatch {
     pub observations: Vec<f32>,
     /// Actions, `[batch, 2]`.
     pub actions: Vec<f32>,
+    /// The teacher's actions, `[batch, 2]`; empty without a teacher.
+    pub teacher_actions: Vec<f32>,
     /// Rewards, `[batch]`.
     pub rewards: Vec<f32>,
     /// Observations after the action, `[batch, observation]`.
@@ -190,6 +192,9 @@ impl Replay {
             episode.write_critic_state(step, row.critic_state);
             episode.write_critic_state(step + 1, row.next_true_state);
             row.action.copy_from_slice(&episode.actions[step]);
+            let teacher = &episode.teacher_actions[step];
+            row.teacher_action
+                .copy_from_slice(&teacher[..row.teacher_action.len()]);
             *row.reward = episode.rewards[step];
             *row.terminated = f32::from(step == last && episode.terminated());
         }
@@ -331,6 +336,7 @@ impl Minibatch {
     fn clear(&mut self) {
         self.observations.clear();
         self.actions.clear();
+        self.teacher_actions.clear();
         self.rewards.clear();
         self.next_observations.clear();
         self.critic_states.clear();
@@ -361,6 +367,7 @@ impl Minibatch {
             self.next_critic_states
                 .extend_from_slice(row.next_true_state);
             self.actions.extend_from_slice(row.action);
+            self.teacher_actions.extend_from_slice(row.teacher_action);
             self.rewards.push(row.reward);
             self.terminated.push(row.terminated);
             if let Some(images) = images {

@@ -7,14 +7,16 @@
 use skein_protocol::config::{Config, CriticInput, ObservationLayout};
 use skein_protocol::{ACTION, CRITIC_STATE, LatentCode};
 
-/// Layout of a row: observation, next observation, true state, next true state, action, reward,
-/// terminated, all `f32`.
+/// Layout of a row: observation, next observation, true state, next true state, action, teacher's
+/// action, reward, terminated, all `f32`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RowLayout {
     /// Length of an observation vector.
     pub(super) observation: usize,
     /// Length of the critic's own input; 0 if the critic sees the observation.
     pub(super) critic_state: usize,
+    /// Length of the teacher's action; 0 without a teacher.
+    pub(super) teacher_action: usize,
 }
 
 /// Mutable view of one row.
@@ -24,6 +26,7 @@ pub(super) struct TransitionRowMut<'a> {
     pub(super) critic_state: &'a mut [f32],
     pub(super) next_true_state: &'a mut [f32],
     pub(super) action: &'a mut [f32],
+    pub(super) teacher_action: &'a mut [f32],
     pub(super) reward: &'a mut f32,
     pub(super) terminated: &'a mut f32,
 }
@@ -36,6 +39,7 @@ pub(super) struct TransitionRow<'a> {
     pub(super) critic_state: &'a [f32],
     pub(super) next_true_state: &'a [f32],
     pub(super) action: &'a [f32],
+    pub(super) teacher_action: &'a [f32],
     pub(super) reward: f32,
     pub(super) terminated: f32,
 }
@@ -49,12 +53,16 @@ impl RowLayout {
                 CriticInput::Observation => 0,
                 CriticInput::GroundTruth => CRITIC_STATE,
             },
+            teacher_action: match config.teacher.is_configured() {
+                true => ACTION,
+                false => 0,
+            },
         }
     }
 
     /// Number of values in a row.
     pub(super) fn width(self) -> usize {
-        2 * (self.observation + self.critic_state) + ACTION + 2
+        2 * (self.observation + self.critic_state) + ACTION + self.teacher_action + 2
     }
 
     fn row(self, values: &[f32]) -> TransitionRow<'_> {
@@ -63,12 +71,14 @@ impl RowLayout {
         let (critic_state, rest) = rest.split_at(self.critic_state);
         let (next_true_state, rest) = rest.split_at(self.critic_state);
         let (action, rest) = rest.split_at(ACTION);
+        let (teacher_action, rest) = rest.split_at(self.teacher_action);
         TransitionRow {
             observation,
             next_observation,
             critic_state,
             next_true_state,
             action,
+            teacher_action,
             reward: rest[0],
             terminated: rest[1],
         }
@@ -80,6 +90,7 @@ impl RowLayout {
         let (critic_state, rest) = rest.split_at_mut(self.critic_state);
         let (next_true_state, rest) = rest.split_at_mut(self.critic_state);
         let (action, rest) = rest.split_at_mut(ACTION);
+        let (teacher_action, rest) = rest.split_at_mut(self.teacher_action);
         let (reward, terminated) = rest.split_at_mut(1);
         TransitionRowMut {
             observation,
@@ -87,6 +98,7 @@ impl RowLayout {
             critic_state,
             next_true_state,
             action,
+            teacher_action,
             reward: &mut reward[0],
             terminated: &mut terminated[0],
         }
@@ -243,7 +255,7 @@ pub struct RingState {
     /// Number of transitions ever inserted.
     pub inserted: u64,
     /// Rows in slot order, `[filled, width]`, laid out as observation, next observation, true
-    /// state, next true state, action, reward, terminated.
+    /// state, next true state, action, teacher's action, reward, terminated.
     pub rows: Vec<f32>,
     /// Number of the depth image of each row's observation, `[filled]`; empty once no images are
     /// kept.

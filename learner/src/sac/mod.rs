@@ -22,9 +22,11 @@ const REPORTED: [Scalar; 5] = [
     Scalar::MeanValue,
 ];
 
-/// Pairs `values`, in the order of [`REPORTED`], with their curves.
-fn reported(values: [f32; REPORTED.len()]) -> Vec<(Scalar, f32)> {
-    REPORTED.into_iter().zip(values).collect()
+/// Pairs `values`, in the order of [`REPORTED`], and the distance to the teacher, if there is one,
+/// with their curves.
+fn reported(values: [f32; REPORTED.len()], teacher_distance: Option<f32>) -> Vec<(Scalar, f32)> {
+    let distance = teacher_distance.map(|distance| (Scalar::TeacherDistance, distance));
+    REPORTED.into_iter().zip(values).chain(distance).collect()
 }
 
 #[cfg(test)]

@@ -16,13 +16,14 @@ mod sample;
 
 use skein_kernels::{Isa, Team, exp};
 use skein_protocol::ACTION;
-use skein_protocol::config::SacSection;
+use skein_protocol::config::{SacSection, TeacherSection};
 use skein_protocol::seeds::{Purpose, derive};
 
 use self::sample::Sample;
 use super::reported;
 use crate::algorithm::{Algorithm, Columns, Inputs};
 use crate::error::{UpdateError, must_be_finite};
+use crate::imitation::imitate;
 use crate::metrics::Scalar;
 use crate::networks::native::{
     CriticLayers, Dense, ESTIMATES, Layers, Learned, NativeCritic, follow, join, output,
@@ -50,6 +51,7 @@ pub struct NativeSac {
     discount: f32,
     target_rate: f32,
     target_entropy: f32,
+    teacher: TeacherSection,
     buffers: UpdateBuffers,
 }
 
@@ -115,8 +117,16 @@ impl NativeSac {
             discount: section.discount as f32,
             target_rate: section.target_rate as f32,
             target_entropy: section.target_entropy.value() as f32,
+            teacher: TeacherSection::default(),
             buffers: UpdateBuffers::default(),
         }
+    }
+
+    /// Lets the actions of `teacher` attract the policy.
+    #[must_use]
+    pub fn with_teacher(mut self, teacher: &TeacherSection) -> Self {
+        self.teacher = teacher.clone();
+        self
     }
 
     /// Draws actions from the current policy: a' for the next observations, a for the observations.
@@ -193,19 +203,23 @@ impl NativeSac {
     }
 
     /// Computes the policy's gradient: makes actions of higher value likelier, at a price for lost
-    /// entropy.
+    /// entropy. With a teacher, its action a* attracts the policy's mode, with a weight λ that
+    /// falls to zero.
     ///
     /// ```text
     /// loss = α log π(a | s) - min Q(s, a), mean over the batch           (eq. 7)
+    ///        + λ |tanh μ(s) - a*|²
     /// ```
     ///
-    /// Returns the loss and the mean of log π.
+    /// Returns the loss without the teacher's term, the mean of log π, and the squared distance to
+    /// the teacher.
     fn policy_gradient(
         &mut self,
         team: &mut Team,
         columns: Columns<'_>,
         temperature: f32,
-    ) -> [f32; 2] {
+    ) -> ([f32; 2], Option<f32>) {
+        let weight = self.teacher.loss_weight_after(self.updates()) as f32;
         let UpdateBuffers {
             rows,
             sample,
@@ -243,6 +257,10 @@ impl NativeSac {
             action_grad,
             output_mut(policy_grad),
         );
+        let distance = columns.teacher_actions.map(|teacher| {
+            let outputs = output(policy_activations);
+            imitate(outputs, teacher, weight, output_mut(policy_grad))
+        });
         self.policy
             .backward(team, policy, policy_activations, policy_grad);
         let into = &mut self.policy_parameters.gradient;
@@ -253,7 +271,8 @@ impl NativeSac {
             policy_grad,
             into,
         );
-        [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32)
+        let means = [loss, log_prob_sum].map(|sum| (sum / *rows as f64) as f32);
+        (means, distance)
     }
 
     /// Allocates the buffers for an update of `rows` transitions.
@@ -325,7 +344,7 @@ impl Algorithm for NativeSac {
         let temperature = exp(self.log_temperature.values[0]);
         self.draw(team, columns, noise);
         let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
-        let [policy_loss, log_prob] = self.policy_gradient(team, columns, temperature);
+        let ([policy_loss, log_prob], distance) = self.policy_gradient(team, columns, temperature);
         // The derivative of -α (log π + H̄) by log α is the expression itself (eq. 18). The
         // temperature rises while the entropy is below its target, and falls otherwise.
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
@@ -338,7 +357,7 @@ impl Algorithm for NativeSac {
         self.log_temperature.step(team, isa);
         let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
         follow(team, isa, target, critic, self.target_rate);
-        Ok(reported(metrics))
+        Ok(reported(metrics, distance))
     }
 
     fn updates(&self) -> u64 {

@@ -17,6 +17,8 @@ pub(crate) struct Transitions {
     pub(crate) terminated: Vec<f32>,
     /// Images before and after the actions.
     pub(crate) images: Option<[Vec<u8>; 2]>,
+    /// The teacher's actions.
+    pub(crate) teacher_actions: Option<Vec<f32>>,
 }
 
 impl Transitions {
@@ -33,6 +35,7 @@ impl Transitions {
             critic_states: None,
             terminated: (0..rows).map(|row| f32::from(row % 3 == 1)).collect(),
             images: None,
+            teacher_actions: None,
         }
     }
 
@@ -44,6 +47,14 @@ impl Transitions {
                 .collect()
         };
         self.critic_states = Some([draw(), draw()]);
+        self
+    }
+
+    /// Gives the transitions a teacher that does what the first two numbers of the observation say.
+    pub(crate) fn with_teacher(mut self) -> Self {
+        let width = self.observations.len() / self.rewards.len();
+        let rows = self.observations.chunks_exact(width);
+        self.teacher_actions = Some(rows.flat_map(|row| &row[..2]).copied().collect());
         self
     }
 
@@ -62,6 +73,7 @@ impl Transitions {
             critic_states: None,
             terminated: vec![1.0; rows],
             images: None,
+            teacher_actions: None,
             observations,
             actions,
         }
@@ -103,6 +115,7 @@ impl Transitions {
                 .images
                 .as_ref()
                 .map(|images| images.each_ref().map(Vec::as_slice)),
+            teacher_actions: self.teacher_actions.as_deref(),
         }
     }
 }

@@ -3,7 +3,7 @@
 
 use skein_kernels::Team;
 use skein_protocol::ACTION;
-use skein_protocol::config::SacSection;
+use skein_protocol::config::{SacSection, TeacherSection};
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
 
@@ -40,6 +40,7 @@ pub struct TorchSac {
     discount: f64,
     target_rate: f64,
     target_entropy: f64,
+    teacher: TeacherSection,
 }
 
 impl TorchSac {
@@ -86,7 +87,15 @@ impl TorchSac {
             discount: section.discount,
             target_rate: section.target_rate,
             target_entropy: section.target_entropy.value(),
+            teacher: TeacherSection::default(),
         }
+    }
+
+    /// Lets the actions of `teacher` attract the policy.
+    #[must_use]
+    pub fn with_teacher(mut self, teacher: &TeacherSection) -> Self {
+        self.teacher = teacher.clone();
+        self
     }
 
     /// Draws actions from the current policy, with their log-probabilities.
@@ -152,7 +161,7 @@ impl Algorithm for TorchSac {
         let critic_loss = critic_loss(&values, &targets);
         let critic_gradient = self.critic_parameters.gradient(&critic_loss);
 
-        // Policy: minimise α log π(a | s) - min Q(s, a) (eq. 7).
+        // Policy: minimise α log π(a | s) - min Q(s, a) (eq. 7), and a teacher's term.
         let drawn = self.draw(&batch.observations, noise);
         let drawn_values = self.critic.smaller(
             &self.critic_parameters,
@@ -160,7 +169,17 @@ impl Algorithm for TorchSac {
             &drawn.actions,
         );
         let policy_loss = policy_loss(&drawn.log_prob, &drawn_values, &temperature);
-        let policy_gradient = self.policy_parameters.gradient(&policy_loss);
+        let distance = batch.teacher_actions.as_ref().map(|teacher| {
+            let mode = self
+                .policy
+                .mode(&self.policy_parameters, &batch.observations);
+            (mode - teacher).square().sum(None) / batch.rows() as f64
+        });
+        let weight = self.teacher.loss_weight_after(self.updates());
+        let policy_gradient = self.policy_parameters.gradient(&match &distance {
+            Some(distance) => &policy_loss + weight * distance,
+            None => policy_loss.shallow_clone(),
+        });
 
         // Temperature: rises while the entropy is below its target, falls otherwise (eq. 18).
         let log_prob = drawn.log_prob.detach();
@@ -193,7 +212,8 @@ impl Algorithm for TorchSac {
             .step(&mut self.log_temperature, &temperature_gradient);
         self.target_parameters
             .follow(&self.critic_parameters, self.target_rate);
-        Ok(reported(metrics))
+        let distance = distance.map(|distance| distance.double_value(&[]) as f32);
+        Ok(reported(metrics, distance))
     }
 
     fn updates(&self) -> u64 {

@@ -570,7 +570,8 @@ fn all_codes_are_the_encoders(trainer: &Trainer, epochs: u64) -> bool {
     encoded == all
 }
 
-/// Number of rows drawn of the first `epochs` whose code is the present encoder's, and of all drawn.
+/// Number of rows drawn of the first `epochs` whose code is the present encoder's, and of all
+/// drawn.
 fn encoded_rows(trainer: &Trainer, epochs: u64) -> (usize, usize) {
     let network = Network::new(&trainer.snapshot(PolicyVersion(epochs)), &trainer.layout);
     let code = |(episode, step)| {

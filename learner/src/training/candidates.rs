@@ -11,8 +11,8 @@ use skein_protocol::ticket::Ticket;
 use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::{Training, TrainingError};
-use crate::best::{is_better, is_candidate};
-use crate::checkpoint::BestSnapshot;
+use crate::best::{is_better, is_candidate, may_replace, next_look};
+use crate::checkpoint::{BestSnapshot, EpisodeWalls};
 use crate::curriculum;
 use crate::episode::CommittedEpisode;
 use crate::episodes::assembly::KeptData;
@@ -30,16 +30,7 @@ impl Training<'_> {
             return Ok(());
         }
         let version = self.progress.version();
-        let (run, number) = (self.identity.run, self.progress.evaluations);
-        let tickets = curriculum::confirmation(self.config, run, number, version);
-        let flown = self.evaluate(tickets, KeptData::Latents)?;
-        die_if_armed(FaultPoint::LearnerCandidateFlown);
-        self.note_trained(&flown);
-        let passed: f64 = flown
-            .iter()
-            .map(|episode| f64::from(episode.walls_passed))
-            .sum();
-        let candidate = BestSnapshot {
+        let mut candidate = BestSnapshot {
             policy_version: version.0,
             episodes: self.progress.episodes,
             window_walls_passed: self
@@ -48,27 +39,33 @@ impl Training<'_> {
                 .walls_passed
                 .mean()
                 .unwrap_or_default(),
-            confirmed_walls_passed: passed / flown.len() as f64,
+            confirmed: Vec::new(),
         };
+        let may_be_best = self.fly_confirmation(&mut candidate)?;
+        die_if_armed(FaultPoint::LearnerCandidateFlown);
+        if may_be_best {
+            self.note_trained(&candidate.confirmed);
+        }
         self.metrics.scalars(
             self.last_episode(),
             &[(
                 Scalar::EvaluationWallsPassed,
-                candidate.confirmed_walls_passed,
+                candidate.confirmed_walls_passed(),
             )],
         )?;
         let best = self.progress.best.as_ref();
         tracing::info!(
             version = candidate.policy_version,
             episodes = candidate.episodes,
-            walls_passed = candidate.confirmed_walls_passed,
+            walls_passed = candidate.confirmed_walls_passed(),
+            confirmation_episodes = candidate.confirmed.len(),
             window_walls_passed = candidate.window_walls_passed,
             best_version = best.map(|best| best.policy_version),
-            best_walls_passed = best.map(|best| best.confirmed_walls_passed),
+            best_walls_passed = best.map(BestSnapshot::confirmed_walls_passed),
             "candidate for the best snapshot flown"
         );
         self.progress.latest_candidate = Some(self.progress.episodes);
-        if is_better(&candidate, best) {
+        if may_be_best && is_better(&candidate, best) {
             self.progress.best = Some(candidate);
             self.save_snapshot(version, &self.directory.best_snapshot())?;
             die_if_armed(FaultPoint::LearnerBestSaved);
@@ -76,22 +73,48 @@ impl Training<'_> {
         Ok(())
     }
 
-    /// Records the effort of training, the first time that `flown` reach the configured success
-    /// rate.
-    pub(super) fn note_trained(&mut self, flown: &[CommittedEpisode]) {
-        let sum = |of: fn(&CommittedEpisode) -> u8| {
-            flown
+    /// Flies the confirmation episodes of `candidate`, from look to look, and adds them to it.
+    /// Returns `false` if it gave the candidate up before the last one.
+    fn fly_confirmation(&mut self, candidate: &mut BestSnapshot) -> Result<bool, TrainingError> {
+        let (run, number) = (self.identity.run, self.progress.evaluations);
+        let version = PolicyVersion(candidate.policy_version);
+        let mut tickets = curriculum::confirmation(self.config, run, number, version);
+        let all = tickets.len() as u64;
+        while !tickets.is_empty() {
+            let flown = candidate.confirmed.len();
+            let rest = tickets.split_off(next_look(flown).min(tickets.len()));
+            let flown = self.fly(tickets, (flown as u64, all), KeptData::Latents)?;
+            tickets = rest;
+            candidate
+                .confirmed
+                .extend(flown.iter().map(|episode| EpisodeWalls {
+                    passed: episode.walls_passed,
+                    of: episode.course_walls,
+                }));
+            if !may_replace(candidate, self.progress.best.as_ref()) {
+                break;
+            }
+        }
+        self.count_evaluation(candidate.confirmed.len() as u64);
+        Ok(tickets.is_empty())
+    }
+
+    /// Records the effort of training, the first time that the `confirmed` episodes reach the
+    /// configured success rate.
+    pub(super) fn note_trained(&mut self, confirmed: &[EpisodeWalls]) {
+        let sum = |of: fn(&EpisodeWalls) -> u8| {
+            confirmed
                 .iter()
-                .map(|episode| f64::from(of(episode)))
+                .map(|walls| f64::from(of(walls)))
                 .sum::<f64>()
         };
-        let rate = sum(|episode| episode.walls_passed) / sum(|episode| episode.course_walls);
+        let rate = sum(|walls| walls.passed) / sum(|walls| walls.of);
         if self.progress.trained.is_some() || rate < self.config.evaluation.trained_rate {
             return;
         }
         let trained = Trained {
             rate,
-            confirmation_episodes: flown.len() as u64,
+            confirmation_episodes: confirmed.len() as u64,
             episodes: self.progress.episodes,
             steps: self.trainer.steps(),
             updates: self.trainer.updates(),
@@ -131,20 +154,25 @@ impl Training<'_> {
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         let (run, number) = (self.identity.run, self.progress.evaluations);
         let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
-        self.evaluate(tickets, keep)
+        let total = tickets.len() as u64;
+        let flown = self.fly(tickets, (0, total), keep)?;
+        self.count_evaluation(total);
+        Ok(flown)
     }
 
-    /// Flies `tickets` of the next evaluation, whose snapshot is published.
-    fn evaluate(
+    /// Flies `tickets`, whose snapshot is published. `progress`: episodes of this evaluation flown
+    /// before, and all of them.
+    fn fly(
         &mut self,
         tickets: Vec<Ticket>,
+        progress: (u64, u64),
         keep: KeptData,
     ) -> Result<Vec<CommittedEpisode>, TrainingError> {
         self.timer.lap(Stage::OtherTraining, 0);
-        let total = tickets.len() as u64;
-        self.reporter.update(|progress| {
-            progress.phase = LearnerPhase::Evaluating;
-            progress.evaluation_episodes = (0, total);
+        let count = tickets.len() as u64;
+        self.reporter.update(|report| {
+            report.phase = LearnerPhase::Evaluating;
+            report.evaluation_episodes = progress;
         });
         let mut batch = self
             .receiver
@@ -152,13 +180,17 @@ impl Training<'_> {
         let mut flown = Vec::with_capacity(batch.remaining());
         while let Some(episode) = batch.next(self.stop)? {
             self.reporter
-                .update(|progress| progress.evaluation_episodes.0 += 1);
+                .update(|report| report.evaluation_episodes.0 += 1);
             flown.push(episode);
         }
-        self.progress.evaluations += 1;
-        self.progress.evaluation_episodes += total;
-        self.timer.lap(Stage::Evaluate, total);
+        self.timer.lap(Stage::Evaluate, count);
         Ok(flown)
+    }
+
+    /// Counts an evaluation of so many episodes.
+    fn count_evaluation(&mut self, episodes: u64) {
+        self.progress.evaluations += 1;
+        self.progress.evaluation_episodes += episodes;
     }
 
     /// Evaluates the best snapshot on all courses and writes the report.

@@ -8,6 +8,7 @@ use std::time::Instant;
 use std::{fs, io};
 
 use skein_protocol::config::{Config, LearningSection};
+use skein_protocol::files::{self, TABLE_BYTES};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::progress::{self, LearnerPhase};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
@@ -332,7 +333,7 @@ fn resume_metrics(
 /// before any checkpoint are simply flown again.
 fn refuse_lost_checkpoints(directory: &RunDirectory, config: &Config) -> Result<(), TrainingError> {
     let episodes_csv = directory.episodes_csv();
-    let content = match fs::read(&episodes_csv) {
+    let content = match files::read(&episodes_csv, TABLE_BYTES) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         content => content.map_err(file_error(&episodes_csv))?,
     };
@@ -425,7 +426,7 @@ fn summary(
         policy_sha256: progress.policy_sha256.clone(),
         final_version: progress.version(),
         best_version: best.map(|best| PolicyVersion(best.policy_version)),
-        best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed),
+        best_confirmed_walls_passed: best.map(|best| best.confirmed_walls_passed()),
         trained: progress.trained,
         untrained: untrained(
             &config.learning,

@@ -5,7 +5,7 @@ use skein_run::LearnerLock;
 use tempfile::TempDir;
 
 use super::*;
-use crate::checkpoint::BestSnapshot;
+use crate::checkpoint::{BestSnapshot, EpisodeWalls};
 use crate::episode::samples;
 
 /// A run that has just begun, without actors.
@@ -64,7 +64,7 @@ impl Training<'_> {
             policy_version: self.progress.version().0,
             episodes: self.progress.episodes,
             window_walls_passed: 1.0,
-            confirmed_walls_passed: 1.0,
+            confirmed: vec![EpisodeWalls { passed: 1, of: 5 }],
         });
         let best = self.directory.best_snapshot();
         self.save_snapshot(self.progress.version(), &best).unwrap();
@@ -204,11 +204,7 @@ fn the_last_snapshot_is_a_candidate_once_whatever_was_flown() {
 fn a_run_counts_as_trained_from_the_configured_rate_on_and_only_once() {
     let run = BegunRun::new(|config| config.evaluation.trained_rate = 0.5);
     let mut training = run.begin();
-    let passed = |walls_passed| {
-        let mut episode = samples::episode(0, 2, Outcome::Collided);
-        (episode.walls_passed, episode.course_walls) = (walls_passed, 4);
-        [episode]
-    };
+    let passed = |passed| [EpisodeWalls { passed, of: 4 }];
     training.note_trained(&passed(1));
     assert!(training.progress.trained.is_none());
     training.note_trained(&passed(2));

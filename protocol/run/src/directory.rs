@@ -9,6 +9,7 @@ use serde::Deserialize;
 use crate::{RunIdentity, durable, inputs};
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::{Config, ConfigError};
+use skein_protocol::files::{self, REPORT_BYTES, SETTINGS_BYTES};
 use skein_protocol::ids::ActorId;
 
 /// Paths within a run's directory.
@@ -181,8 +182,8 @@ impl RunDirectory {
         Ok(())
     }
 
-    /// Reads identity and configuration of an existing run, and checks that its course files and its
-    /// encoder are those it was started with.
+    /// Reads identity and configuration of an existing run, and checks that its course files and
+    /// its encoder are those it was started with.
     ///
     /// # Errors
     /// [`RunError`] names the file and the problem.
@@ -249,7 +250,7 @@ impl RunDirectory {
         fit: impl Fn(&RunIdentity, &Config) -> bool,
     ) -> Result<(RunIdentity, Config), RunError> {
         let path = self.identity();
-        let text = fs::read_to_string(&path).map_err(|source| RunError::Io {
+        let text = files::read_text(&path, REPORT_BYTES).map_err(|source| RunError::Io {
             path: path.clone(),
             source,
         })?;
@@ -292,7 +293,7 @@ impl RunDirectory {
     fn started_config(&self, identity: &RunIdentity) -> Option<String> {
         let copies = self.checkpoint_names().into_iter().map(|episodes| {
             let file = format!("episode-{episodes}/config.toml");
-            fs::read_to_string(self.checkpoints().join(file))
+            files::read_text(&self.checkpoints().join(file), SETTINGS_BYTES)
         });
         copies
             .flatten()

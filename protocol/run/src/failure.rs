@@ -1,6 +1,7 @@
 //! Exit statuses and error messages of the programs.
 
 use std::error::Error;
+use std::io;
 use std::iter::successors;
 
 /// Exit status of a program whose arguments are wrong, as clap's.
@@ -17,15 +18,24 @@ pub const EXIT_RESTART: u8 = 4;
 /// Exit status of a program that its user interrupted, as shells report it: 128 + SIGINT.
 pub const EXIT_INTERRUPTED: u8 = 130;
 
-/// Returns the error with those of its causes that it does not quote itself, on one line.
+/// Returns the error with those of its causes that it does not quote itself, on one line. A file
+/// beyond the process's limit gets its remedy here, whoever wrote it.
 pub fn with_causes(error: &(dyn Error + 'static)) -> String {
-    successors(Some(error), |&error| error.source())
+    let causes = || successors(Some(error), |&error| error.source());
+    let text = causes()
         .map(ToString::to_string)
         .fold(String::new(), |text, cause| match text.as_str() {
             "" => cause,
             message if message.contains(&cause) => text,
             message => format!("{message}: {cause}"),
-        })
+        });
+    let too_large = causes()
+        .filter_map(|cause| cause.downcast_ref::<io::Error>())
+        .any(|cause| cause.kind() == io::ErrorKind::FileTooLarge);
+    match too_large {
+        true => format!("{text}: the shell limits the size of files; raise it with ulimit -f"),
+        false => text,
+    }
 }
 
 #[cfg(test)]
@@ -51,5 +61,13 @@ mod tests {
         assert_eq!(with_causes(&silent), format!("cannot write: {message}"));
         let text: &'static str = format!("cannot write: {message}").leak();
         assert_eq!(with_causes(&Outer { text, cause }), text);
+    }
+
+    #[test]
+    fn a_file_beyond_the_limit_has_its_remedy() {
+        let large = io::Error::from(io::ErrorKind::FileTooLarge);
+        assert!(with_causes(&large).contains("ulimit -f"));
+        let full = io::Error::from(io::ErrorKind::StorageFull);
+        assert!(!with_causes(&full).contains("ulimit"));
     }
 }

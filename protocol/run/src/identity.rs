@@ -18,6 +18,7 @@ use serde::{Deserialize, Serialize};
 use super::private_files::{PathError, is_locked};
 use skein_protocol::PROTOCOL_VERSION;
 use skein_protocol::config::Config;
+use skein_protocol::files::{self, REPORT_BYTES};
 use skein_protocol::ids::RunId;
 use skein_protocol::record_layout;
 use skein_protocol::snapshot::SnapshotLayout;
@@ -246,7 +247,7 @@ impl Announcement {
     }
 
     pub(super) fn read(path: &Path) -> Result<Option<Self>, PathError> {
-        match fs::read(path) {
+        match files::read(path, REPORT_BYTES) {
             Ok(bytes) => serde_json::from_slice(&bytes)
                 .map(Some)
                 .map_err(|source| PathError::at(path)(source.into())),

@@ -10,6 +10,7 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use super::RunError;
 use skein_protocol::config::Config;
+use skein_protocol::files::{self, TENSOR_BYTES};
 
 /// Returns the checksum of each file in `folder` by its name; none if the folder does not exist.
 pub(super) fn course_checksums(folder: &Path) -> io::Result<BTreeMap<String, String>> {
@@ -110,5 +111,6 @@ fn change(path: &Path, expected: &str) -> Option<String> {
 
 /// Returns the xxh3 in hexadecimal, because JSON numbers do not hold 64 bits everywhere.
 fn checksum(path: &Path) -> io::Result<String> {
-    fs::read(path).map(|content| format!("{:016x}", xxh3_64(&content)))
+    let content = files::read(path, TENSOR_BYTES)?;
+    Ok(format!("{:016x}", xxh3_64(&content)))
 }

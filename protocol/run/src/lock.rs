@@ -306,4 +306,18 @@ mod tests {
         drop((lock, supervisor));
         assert!(!identity.transport_folder().exists());
     }
+
+    #[test]
+    fn a_pipe_in_the_place_of_a_lock_is_not_waited_for() {
+        let directory = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(directory.path());
+        let made = std::process::Command::new("mkfifo")
+            .arg(run.learner_lock())
+            .status();
+        assert!(made.unwrap().success());
+        let (sender, answer) = std::sync::mpsc::channel();
+        std::thread::spawn(move || sender.send(run.is_running().unwrap()));
+        let is_running = answer.recv_timeout(std::time::Duration::from_secs(20));
+        assert_eq!(is_running, Ok(false));
+    }
 }

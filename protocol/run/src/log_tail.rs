@@ -1,8 +1,9 @@
 //! The last lines of a log file, for error messages.
 
-use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
+
+use skein_protocol::files;
 
 /// Number of lines quoted.
 const LINES: usize = 12;
@@ -42,7 +43,7 @@ pub fn last_words(path: &Path, program: &Path) -> Option<String> {
 }
 
 fn read_end(path: &Path) -> std::io::Result<String> {
-    let mut file = File::open(path)?;
+    let mut file = files::open(path, u64::MAX)?.into_inner();
     let length = file.metadata()?.len();
     file.seek(SeekFrom::Start(length.saturating_sub(MAX_BYTES)))?;
     let mut bytes = Vec::new();

@@ -200,7 +200,12 @@ pub(super) fn lock_within(
 
 /// Returns `true` if a process holds the lock of the file at `path`.
 pub(super) fn is_locked(path: &Path) -> Result<bool, PathError> {
-    let file = match File::open(path) {
+    // A pipe in its place is not waited for.
+    let mut options = fs::OpenOptions::new();
+    options
+        .read(true)
+        .custom_flags(OFlags::NONBLOCK.bits().cast_signed());
+    let file = match options.open(path) {
         Ok(file) => file,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
         Err(error) => {

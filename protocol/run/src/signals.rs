@@ -1,4 +1,4 @@
-//! Signals that were ignored when a program started, as under `nohup`, and stay ignored.
+//! Signals that a program ignores: those ignored when it started, as under `nohup`, and SIGXFSZ.
 
 use std::fs;
 use std::os::unix::process::CommandExt;
@@ -11,6 +11,13 @@ use rustix::process::Signal;
 pub fn is_ignored(number: i32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     is_in_mask(&status, number)
+}
+
+/// Lets a write beyond the limit of file sizes (`ulimit -f`) fail with an error, which names its
+/// file. Otherwise SIGXFSZ kills the process without a word. Every program calls this first.
+pub fn survive_file_size_limit() {
+    // SAFETY: ignoring a signal runs no code of this process.
+    unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
 }
 
 /// Returns `true` if the signal's bit is set in the line `SigIgn:` of a process's `status`.
@@ -64,5 +71,12 @@ mod tests {
         };
         assert!(ignored_by_child(|_| {}));
         assert!(!ignored_by_child(|child| heed(child, Signal::USR1)));
+    }
+
+    #[test]
+    fn a_write_beyond_the_limit_of_file_sizes_kills_no_process() {
+        assert!(!is_ignored(libc::SIGXFSZ));
+        survive_file_size_limit();
+        assert!(is_ignored(libc::SIGXFSZ));
     }
 }

@@ -1,7 +1,7 @@
 //! Tables for the terminal.
 
 use comfy_table::presets::UTF8_FULL_CONDENSED;
-use comfy_table::{CellAlignment, ContentArrangement, Table};
+use comfy_table::{CellAlignment, ContentArrangement, Row, Table};
 use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, WallFailures};
 use skein_protocol::stages::{StageTime, StageTimes, ThreadRole};
 
@@ -71,14 +71,49 @@ fn grid(shown: &[TableColumn], report: &EvaluationReport) -> Table {
 }
 
 /// Returns the text of `table` in at most `columns`: cells are broken into lines where it is wider.
+/// Where even its rules do not fit, each cell is a line `title: cell`.
 pub fn fit(mut table: Table, columns: usize) -> String {
     let text = table.to_string();
     if width(&text) <= columns {
         return text;
     }
-    let columns = u16::try_from(columns).unwrap_or(u16::MAX);
     table.set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_width(columns).to_string()
+    table.set_width(u16::try_from(columns).unwrap_or(u16::MAX));
+    let text = table.to_string();
+    match width(&text) <= columns {
+        true => text,
+        false => stacked(&table, columns),
+    }
+}
+
+/// Returns the cells of `table` one below the other, with an empty line between its rows.
+fn stacked(table: &Table, columns: usize) -> String {
+    let titles: Vec<String> = table
+        .header()
+        .into_iter()
+        .flat_map(|header| header.cell_iter().map(|cell| cell.content()))
+        .collect();
+    let of_row = |row: &Row| {
+        let cells = row.cell_iter().map(|cell| cell.content()).zip(&titles);
+        let lines: Vec<_> = cells
+            .filter(|(content, _)| !content.is_empty())
+            .map(|(content, title)| format!("{title}: {content}").replace('\n', " "))
+            .map(|line| broken(&line, columns))
+            .collect();
+        lines.join("\n")
+    };
+    table
+        .row_iter()
+        .map(of_row)
+        .collect::<Vec<_>>()
+        .join("\n\n")
+}
+
+/// Returns `line` in lines of `columns`, broken anywhere.
+fn broken(line: &str, columns: usize) -> String {
+    let characters: Vec<char> = line.chars().collect();
+    let pieces = characters.chunks(columns.max(1)).map(String::from_iter);
+    pieces.collect::<Vec<String>>().join("\n")
 }
 
 /// Returns `text` with those of its Markdown tables that are wider than `columns` broken to fit.
@@ -224,7 +259,7 @@ mod tests {
             policy_version: PolicyVersion(1),
             policy_sha256: String::new(),
             courses: ["training", "non_rectangular"]
-                .map(|name| CourseEvaluation::of(name, 3, episodes))
+                .map(|name| CourseEvaluation::of(name, episodes))
                 .to_vec(),
         }
     }
@@ -233,19 +268,23 @@ mod tests {
     fn no_table_exceeds_the_terminal_and_only_a_wide_one_has_all_in_a_row() {
         let score = EpisodeScore {
             walls_passed: 2,
+            walls: 3,
             episode_return: -12.345,
             outcome: Outcome::Collided,
             hit_wall: None,
         };
         let report = report(&[score; 100]);
         let wide = evaluation_table(&report, usize::MAX);
-        for columns in 60..160 {
+        for columns in 1..160 {
             let table = evaluation_table(&report, columns);
             assert!(width(&table) <= columns, "{columns}:\n{table}");
             assert_eq!(table == wide, width(&wide) <= columns);
             let stages = stages_table(&sample(), columns);
             assert!(width(&stages) <= columns, "{columns}:\n{stages}");
         }
+        // Where no table fits, each cell keeps its title.
+        let stacked = evaluation_table(&report, 12);
+        assert!(stacked.contains("episodes: 10\n0\n"), "{stacked}");
         // At the usual width, no cell is broken.
         let narrow = evaluation_table(&report, 80);
         assert_eq!(narrow.matches("non_rectangular").count(), 2, "{narrow}");
@@ -264,12 +303,16 @@ mod tests {
         for part in ["# Question\n\n", "one", "0.4,", "\n\nEnd."] {
             assert!(narrow.contains(part), "{part:?} is missing in\n{narrow}");
         }
+        let stacked = fit_markdown(text, 8);
+        let rows = "arm: one\nR: 0.5 [\n0.4, 0.6\n]\n\nEnd.";
+        assert!(stacked.contains(rows), "{stacked}");
     }
 
     #[test]
     fn failures_stand_in_course_order_and_a_dot_is_none() {
         let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
+            walls: 3,
             episode_return: 0.0,
             outcome,
             hit_wall,

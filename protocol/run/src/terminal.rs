@@ -4,6 +4,7 @@
 //! Programs print with [`show!`](crate::show) and [`note!`](crate::note), because the standard
 //! library's macros panic when a write fails.
 
+use std::ffi::OsString;
 use std::fmt::Arguments;
 use std::io::{self, IsTerminal, Write};
 use std::os::fd::AsFd;
@@ -83,7 +84,27 @@ fn columns(wanted: Option<&str>, terminal: Option<usize>) -> usize {
 
 /// Returns `true` if standard error is a terminal on which a line can be redrawn.
 pub fn can_redraw() -> bool {
-    io::stderr().is_terminal() && std::env::var_os("TERM").is_none_or(|name| name != "dumb")
+    let stream = match io::stderr().is_terminal() {
+        true => Stream::Terminal(std::env::var_os("TERM")),
+        false => Stream::Other,
+    };
+    stream.can_redraw()
+}
+
+/// Destination of output.
+enum Stream {
+    /// A terminal, with its `TERM`.
+    Terminal(Option<OsString>),
+    Other,
+}
+
+impl Stream {
+    fn can_redraw(&self) -> bool {
+        match self {
+            Self::Terminal(name) => name.as_ref().is_none_or(|name| name != "dumb"),
+            Self::Other => false,
+        }
+    }
 }
 
 /// Returns `text` cut to `columns`, with "…" as its end where something is missing.
@@ -151,6 +172,15 @@ mod tests {
             assert_eq!(columns(unusable, Some(132)), 132);
             assert_eq!(columns(unusable, None), usize::MAX);
         }
+    }
+
+    #[test]
+    fn only_a_terminal_that_is_not_dumb_is_redrawn() {
+        let terminal = |name: Option<&str>| Stream::Terminal(name.map(OsString::from));
+        assert!(terminal(Some("xterm-256color")).can_redraw());
+        assert!(terminal(None).can_redraw());
+        assert!(!terminal(Some("dumb")).can_redraw());
+        assert!(!Stream::Other.can_redraw());
     }
 
     #[test]

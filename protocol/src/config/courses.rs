@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::file::read_text;
 use super::{InvalidValue, require};
+use crate::files::{SETTINGS_BYTES, read_text};
 
 /// The `[courses]` section: the courses of training and evaluation.
 ///
@@ -55,12 +55,13 @@ impl CoursesSection {
 
     /// Returns the names of `courses` in reports: the key `name` of each file. Equal names get the
     /// file's stem in brackets. A file without a name, or that cannot be read, is named by its
-    /// stem.
+    /// stem. In it, "_" stands for what a table or a terminal cannot show.
     pub fn names<P: AsRef<Path>>(courses: &[P]) -> Vec<String> {
         let own: Vec<_> = courses
             .iter()
             .map(|course| {
                 let stem = Self::stem_of(course.as_ref());
+                let stem = stem.replace(|sign: char| sign.is_control() || sign == '|', "_");
                 (
                     name_in(course.as_ref()).unwrap_or_else(|| stem.clone()),
                     stem,
@@ -118,7 +119,7 @@ impl CoursesSection {
 
 /// Returns the key `name` of the course file at `path`, unless it is blank.
 fn name_in(path: &Path) -> Option<String> {
-    let course: toml::Table = toml::from_str(&read_text(path).ok()?).ok()?;
+    let course: toml::Table = toml::from_str(&read_text(path, SETTINGS_BYTES).ok()?).ok()?;
     let name = course.get("name")?.as_str()?.trim();
     (!name.is_empty()).then(|| name.to_owned())
 }
@@ -140,6 +141,7 @@ mod tests {
             write("hall.toml", "name = \"hall\""),
             write("hall_2.toml", "name = \" hall \""),
             write("blank.toml", "name = \"\""),
+            write("un\u{1b}named|.toml", ""),
             folder.path().join("missing.toml"),
         ];
         let names = CoursesSection::names(&courses);
@@ -150,6 +152,7 @@ mod tests {
                 "hall (hall)",
                 "hall (hall_2)",
                 "blank",
+                "un_named_",
                 "missing"
             ]
         );

@@ -1,12 +1,12 @@
 //! Reads a configuration file with overrides, and writes it back.
 
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
 use super::{Config, InvalidValue, MAX_NESTING};
+use crate::files::{SETTINGS_BYTES, read_text};
 
 /// Reason why a configuration cannot be used. Every variant names the file or the override.
 #[derive(Debug, thiserror::Error)]
@@ -45,6 +45,19 @@ pub enum ConfigError {
         /// The key, the value and the bound.
         #[source]
         source: InvalidValue,
+    },
+    /// The variable that names the folder of the default courses is wrong.
+    #[error(
+        "{SHIPPED_CONFIGS}={} names no folder with courses/, where the courses lie that {} does \
+         not name: correct or unset the variable",
+        folder.display(),
+        path.display()
+    )]
+    Shipped {
+        /// The configuration file.
+        path: PathBuf,
+        /// Value of the variable.
+        folder: PathBuf,
     },
     /// An override cannot be parsed.
     #[error("--set {text}: {problem}; write it as section.key=value")]
@@ -114,7 +127,7 @@ impl Config {
     }
 
     fn resolve(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = read_text(path).map_err(|source| ConfigError::Read {
+        let text = read_text(path, SETTINGS_BYTES).map_err(|source| ConfigError::Read {
             path: path.to_owned(),
             source,
         })?;
@@ -158,6 +171,15 @@ impl Config {
             path: path.to_owned(),
             source,
         })?;
+        if let Some(folder) = shipped
+            && named.contains(&false)
+            && !folder.join("courses").is_dir()
+        {
+            return Err(ConfigError::Shipped {
+                path: path.to_owned(),
+                folder: folder.to_owned(),
+            });
+        }
         let directory = path.parent().unwrap_or(Path::new(""));
         let shipped = shipped.unwrap_or(directory);
         let [training, evaluation] = named.map(|named| if named { directory } else { shipped });
@@ -202,23 +224,31 @@ impl Config {
     }
 }
 
-/// Converts the parser's error; of an integer that is too large it knows only the type.
 fn syntax_error(path: &Path, text: &str, error: toml::de::Error) -> ConfigError {
-    let place = error.span().unwrap_or_default();
     let path = path.to_owned();
-    match text.get(place.clone()).filter(|value| is_integer(value)) {
-        Some(value) => ConfigError::Key {
-            path,
-            message: format!(
-                "line {}: {value} {INTEGER_TOO_LARGE}",
-                1 + text[..place.start].matches('\n').count()
-            ),
-        },
+    match integer_too_large(text, &error) {
+        Some(message) => ConfigError::Key { path, message },
         None => ConfigError::Syntax {
             path,
             source: Box::new(error),
         },
     }
+}
+
+/// Returns line, key, value and remedy if `error`, the parser's on `text`, is an integer that TOML
+/// does not hold: the parser knows only the type.
+pub fn integer_too_large(text: &str, error: &toml::de::Error) -> Option<String> {
+    let place = error.span()?;
+    let value = text.get(place.clone()).filter(|value| is_integer(value))?;
+    // One that TOML holds was refused for another reason.
+    if toml::from_str::<Table>(&format!("value = {value}")).is_ok() {
+        return None;
+    }
+    Some(format!(
+        "line {}: {} = {value} {INTEGER_TOO_LARGE}",
+        1 + text[..place.start].matches('\n').count(),
+        key_before(text, place.start)
+    ))
 }
 
 /// Deserializes section by section, so that an error names its section: the parser itself knows
@@ -245,6 +275,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     section(&mut table, "learning", &mut config.learning)?;
     section(&mut table, "sac", &mut config.sac)?;
     section(&mut table, "td3", &mut config.td3)?;
+    section(&mut table, "distill", &mut config.distill)?;
+    section(&mut table, "teacher", &mut config.teacher)?;
     section(&mut table, "vae", &mut config.vae)?;
     section(&mut table, "encoder", &mut config.encoder)?;
     section(&mut table, "replay", &mut config.replay)?;
@@ -255,8 +287,8 @@ fn from_table(mut table: Table) -> Result<Config, String> {
     match table.keys().next() {
         None => Ok(config),
         Some(unknown) => Err(format!(
-            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, vae, \
-            encoder, replay, evaluation, checkpoints, transport, simulator"
+            "unknown section [{unknown}]; known are run, courses, learning, sac, td3, \
+            distill, teacher, vae, encoder, replay, evaluation, checkpoints, transport, simulator"
         )),
     }
 }
@@ -294,8 +326,8 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
 /// Keys that name files.
 pub const FILE_KEYS: [&str; 3] = ["courses.training", "courses.evaluation", "vae.start_from"];
 
-/// Makes paths absolute: paths on the command line are relative to the working directory, not to the
-/// configuration file. Other values are left for validation to refuse.
+/// Makes paths absolute: paths on the command line are relative to the working directory, not to
+/// the configuration file. Other values are left for validation to refuse.
 fn make_absolute(value: &mut Value) -> io::Result<()> {
     match value {
         Value::String(path) => {
@@ -341,30 +373,35 @@ fn parse_value(text: &str) -> Result<Value, &'static str> {
 const INTEGER_TOO_LARGE: &str = "is an integer outside -9223372036854775808 to \
     9223372036854775807 (64 bits with a sign), which TOML does not hold: choose one within";
 
-/// `true` for the digits of a decimal integer, with or without a sign.
+/// `true` for an integer in TOML's notation, of any size.
 fn is_integer(text: &str) -> bool {
-    let digits = text.strip_prefix(['+', '-']).unwrap_or(text);
-    digits.starts_with(|first: char| first.is_ascii_digit())
+    let unsigned = text.strip_prefix(['+', '-']).unwrap_or(text);
+    let (digits, radix) = match unsigned.get(..2) {
+        Some("0x") => (&unsigned[2..], 16),
+        Some("0o") => (&unsigned[2..], 8),
+        Some("0b") => (&unsigned[2..], 2),
+        _ => (unsigned, 10),
+    };
+    digits.starts_with(|first: char| first.is_digit(radix))
         && digits
             .chars()
-            .all(|digit| digit.is_ascii_digit() || digit == '_')
+            .all(|digit| digit.is_digit(radix) || digit == '_')
 }
 
-/// Reads a text file of ordinary size. Reading a pipe or a device might never end.
-pub(super) fn read_text(path: &Path) -> io::Result<String> {
-    /// Many times the size of a configuration with every key and a comment on each.
-    const MAX_BYTES: u64 = 1 << 20;
-    let about = fs::metadata(path)?;
-    if !about.is_file() || about.len() > MAX_BYTES {
-        return Err(io::Error::other(format!(
-            "it is not a text file of at most {MAX_BYTES} bytes"
-        )));
-    }
-    fs::read_to_string(path)
+/// Returns the key whose value begins at byte `start` of the TOML `text`.
+fn key_before(text: &str, start: usize) -> &str {
+    let before = text.get(..start).unwrap_or_default();
+    let key = before
+        .rsplit_once('=')
+        .map_or("", |(key, _)| key.trim_end());
+    let ends = |sign: char| sign.is_whitespace() || ",{".contains(sign);
+    key.rsplit(ends).next().unwrap_or_default()
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::config::{Device, Engine, TargetEntropy};
 
@@ -433,28 +470,29 @@ mod tests {
 
     #[test]
     fn courses_that_are_not_named_are_the_shipped_ones() {
+        let shipped = tempfile::tempdir().unwrap();
+        let folder = shipped.path().join("courses");
         let parse = |text| {
             let path = Path::new("/mine/own.toml");
-            Config::parse_with(text, path, &[], Some(Path::new("/skein/configs"))).unwrap()
+            Config::parse_with(text, path, &[], Some(shipped.path()))
         };
-        let courses = parse("").courses;
+        let error = parse("").unwrap_err().to_string();
+        let blamed = format!("SKEIN_CONFIGS={} names no folder", shipped.path().display());
         assert!(
-            courses
-                .paths()
-                .all(|course| course.starts_with("/skein/configs/courses"))
+            error.contains(&blamed) && error.contains("own.toml"),
+            "{error}"
         );
+        assert!(parse("courses = { training = \"a\", evaluation = [\"b\"] }").is_ok());
+        fs::create_dir(&folder).unwrap();
+        let parse = |text| parse(text).unwrap();
+        let courses = parse("").courses;
+        assert!(courses.paths().all(|course| course.starts_with(&folder)));
         let courses = parse("[courses]\ntraining = \"a.toml\"").courses;
         assert_eq!(courses.training, Path::new("/mine/a.toml"));
-        assert_eq!(
-            courses.evaluation[0],
-            Path::new("/skein/configs/courses/training.toml")
-        );
+        assert_eq!(courses.evaluation[0], folder.join("training.toml"));
         let courses = parse("[courses]\nevaluation = [\"b.toml\"]").courses;
         assert_eq!(courses.evaluation, [Path::new("/mine/b.toml")]);
-        assert_eq!(
-            courses.training,
-            Path::new("/skein/configs/courses/training.toml")
-        );
+        assert_eq!(courses.training, folder.join("training.toml"));
     }
 
     #[test]
@@ -582,6 +620,8 @@ mod tests {
             "9223372036854775808",
             "18446744073709551616",
             "-9223372036854775809",
+            "0xffff_ffff_ffff_ffff",
+            "0o7777777777777777777777",
         ] {
             let set = load("", &[&format!("run.seed={seed}")]).unwrap_err();
             assert!(
@@ -590,10 +630,18 @@ mod tests {
             );
             let file = load(&format!("[run]\nepisodes = 9\nseed = {seed} # x"), &[]).unwrap_err();
             assert!(
-                file.contains(&format!("test.toml: line 3: {seed} is an integer outside")),
+                file.contains(&format!(
+                    "test.toml: line 3: seed = {seed} is an integer outside"
+                )),
                 "{file}"
             );
         }
+        let inline = load("run = { episodes = 9, seed = 9223372036854775808 }", &[]);
+        let inline = inline.unwrap_err();
+        assert!(
+            inline.contains("line 1: seed = 9223372036854775808"),
+            "{inline}"
+        );
         let largest = load("", &["run.seed=9223372036854775807"]).unwrap();
         assert_eq!(largest.run.seed, i64::MAX as u64);
     }

@@ -17,8 +17,8 @@ const MAX_HISTORY: usize = 16;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LearningSection {
-    /// Learning algorithm: `sac` or `td3`, each with a section of its own. Default `sac`, as in the
-    /// paper.
+    /// Learning algorithm: `sac`, `td3` or `distill`, each with a section of its own. `distill`
+    /// needs a `[teacher]`. Default `sac`, as in the paper.
     pub algorithm: AlgorithmName,
     /// Training of the encoder, which turns a depth image into the policy's input. `vae` trains it
     /// as a variational auto-encoder. `end-to-end` trains it by the critic's loss; then `[vae]`
@@ -247,6 +247,8 @@ pub enum AlgorithmName {
     Sac,
     /// Twin delayed deep deterministic policy gradient.
     Td3,
+    /// Regression on a teacher's actions.
+    Distill,
 }
 
 impl fmt::Display for AlgorithmName {
@@ -254,6 +256,7 @@ impl fmt::Display for AlgorithmName {
         f.write_str(match self {
             Self::Sac => "sac",
             Self::Td3 => "td3",
+            Self::Distill => "distill",
         })
     }
 }

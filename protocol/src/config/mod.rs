@@ -5,6 +5,7 @@
 //! and is passed on unread: this crate knows no physics.
 
 mod courses;
+mod distill;
 mod encoder;
 mod evaluation;
 mod file;
@@ -14,6 +15,7 @@ mod replay;
 mod run;
 mod sac;
 mod td3;
+mod teacher;
 mod transport;
 mod vae;
 
@@ -24,9 +26,10 @@ use serde::{Deserialize, Serialize};
 use crate::segment::MAX_PRIOR_ACTIONS;
 
 pub use courses::CoursesSection;
+pub use distill::DistillSection;
 pub use encoder::EncoderSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
-pub use file::{ConfigError, FILE_KEYS, failing_override};
+pub use file::{ConfigError, FILE_KEYS, failing_override, integer_too_large};
 pub use learning::{
     AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
 };
@@ -34,6 +37,7 @@ pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};
 pub use sac::{SacSection, TargetEntropy};
 pub use td3::Td3Section;
+pub use teacher::{TeacherName, TeacherSection};
 pub use transport::TransportSection;
 pub use vae::{DecoderName, VaeSection};
 
@@ -51,6 +55,10 @@ pub struct Config {
     pub sac: SacSection,
     /// Twin delayed deep deterministic policy gradient.
     pub td3: Td3Section,
+    /// Regression on a teacher's actions.
+    pub distill: DistillSection,
+    /// Teacher.
+    pub teacher: TeacherSection,
     /// Variational auto-encoder.
     pub vae: VaeSection,
     /// Encoder trained before any run.
@@ -78,6 +86,7 @@ impl Config {
         match self.learning.algorithm {
             AlgorithmName::Sac => ("sac.batch_size", self.sac.batch_size),
             AlgorithmName::Td3 => ("td3.batch_size", self.td3.batch_size),
+            AlgorithmName::Distill => ("distill.batch_size", self.distill.batch_size),
         }
     }
 
@@ -101,9 +110,10 @@ impl Config {
     }
 
     /// Returns the engine of policy and critic: the run's engine, except that TD3 and learning from
-    /// images exist for libtorch only.
+    /// images exist for libtorch only, and distillation for the native engine only.
     pub fn policy_engine(&self) -> Engine {
         match (self.learning.algorithm, self.learning.encoder) {
+            (AlgorithmName::Distill, _) => Engine::Native,
             (AlgorithmName::Sac, EncoderTraining::Vae) => self.run.engine(),
             (AlgorithmName::Td3, _) | (_, EncoderTraining::EndToEnd) => Engine::Libtorch,
         }
@@ -119,6 +129,8 @@ impl Config {
         self.learning.validate()?;
         self.sac.validate()?;
         self.td3.validate()?;
+        self.distill.validate()?;
+        self.teacher.validate()?;
         self.vae.validate()?;
         self.encoder.validate()?;
         self.replay.validate()?;
@@ -145,6 +157,7 @@ impl Config {
         )?;
         self.validate_segments()?;
         self.validate_encoder()?;
+        self.validate_teacher()?;
         let (key, batch_size) = self.batch_size_by_key();
         require(
             batch_size <= self.learning.warmup_steps.max(1),
@@ -204,6 +217,39 @@ impl Config {
             )?;
         }
         Ok(())
+    }
+
+    /// Checks what a teacher, and learning from one, require of other sections.
+    fn validate_teacher(&self) -> Result<(), InvalidValue> {
+        let (algorithm, taught) = (self.learning.algorithm, self.teacher.is_configured());
+        require(
+            taught || algorithm != AlgorithmName::Distill,
+            "teacher.policy",
+            "none",
+            "does not go with learning.algorithm = \"distill\", which learns from a teacher \
+            alone: set it to \"oracle\"",
+        )?;
+        require(
+            !taught || algorithm != AlgorithmName::Td3,
+            "teacher.policy",
+            "oracle",
+            "does not go with learning.algorithm = \"td3\", which learns from rewards alone: set \
+            it to \"none\"",
+        )?;
+        require(
+            algorithm != AlgorithmName::Distill || !self.learning.end_to_end(),
+            "learning.encoder",
+            "end-to-end",
+            "does not go with learning.algorithm = \"distill\", which has no critic to train the \
+            encoder: set it to \"vae\"",
+        )?;
+        require(
+            !taught || !self.learning.in_segments(),
+            "learning.segment_steps",
+            self.learning.segment_steps,
+            "does not go with a teacher, who follows whole episodes: set it to 0, or \
+            teacher.policy to \"none\"",
+        )
     }
 
     /// Checks what segments require of other sections.

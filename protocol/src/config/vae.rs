@@ -19,12 +19,13 @@ pub struct VaeSection {
     /// Length of the latent code: 8, 16, 32 or 64. Default 32, as in the paper.
     pub latent: usize,
     /// File with an encoder to fly with from the first episode on, frozen: one that `skein encoder`
-    /// wrote, or any snapshot. Requires `train_steps` = 0. The path is relative to the configuration
-    /// file; with `--set`, to the working directory. Default: none, the VAE is trained along.
+    /// wrote, or any snapshot. Requires `train_steps` = 0. The path is relative to the
+    /// configuration file; with `--set`, to the working directory. Default: none, the VAE is
+    /// trained along.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start_from: Option<PathBuf>,
-    /// Environment steps during which the VAE is trained, 1 to 200,000; 0 with `start_from`. Then it
-    /// is frozen and stored latent codes are recomputed. Default 10000, as in the paper.
+    /// Environment steps during which the VAE is trained, 1 to 200,000; 0 with `start_from`. Then
+    /// it is frozen and stored latent codes are recomputed. Default 10000, as in the paper.
     pub train_steps: usize,
     /// Environment steps after which stored latent codes are recomputed while the VAE is still
     /// trained, so that a policy that learns meanwhile sees the codes of one encoder. 0 recomputes

@@ -59,6 +59,7 @@ fn ticket(run: RunId) -> Ticket {
         start_level: 1,
         exploration: Exploration::Uniform,
         seed: 7,
+        teacher_share: None,
         segment: None,
     }
 }

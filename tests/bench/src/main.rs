@@ -15,6 +15,7 @@ use skein_bench::machine::{Core, Machine};
 use skein_bench::table::{Judging, Table};
 use skein_reports::growth::{GrowthLine, GrowthPicture};
 use skein_run::failure::with_causes;
+use skein_run::signals::survive_file_size_limit;
 use skein_run::terminal::stdout_columns;
 use skein_run::{note, show};
 
@@ -64,6 +65,7 @@ struct Results<'a> {
 }
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     let done = match Cli::parse().command {
         Command::List { only, growth } => list(
             &only,

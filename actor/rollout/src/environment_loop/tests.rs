@@ -63,6 +63,7 @@ pub(super) fn ticket(exploration: Exploration, seed: u64) -> Ticket {
         start_level: 2,
         exploration,
         seed,
+        teacher_share: None,
         segment: None,
     }
 }
@@ -196,6 +197,47 @@ fn each_record_holds_the_observation_and_the_reward_of_its_step() {
         assert_eq!(pair[0].reward_terms, expected.values());
         assert_eq!(pair[0].reward, pair[0].reward_terms.iter().sum::<f32>());
     }
+}
+
+#[test]
+fn the_teacher_is_recorded_in_each_step_and_flies_its_share() {
+    let fly = |teacher_share| {
+        let ticket = Ticket {
+            teacher_share,
+            ..ticket(Exploration::Sample, 1)
+        };
+        let (score, tape) = flown(&mut environment_loop(""), &ticket);
+        (score.outcome, tape.sent)
+    };
+    let flown_by_teacher = |records: &[Box<TransitionRecord>]| {
+        let steps = &records[..records.len() - 1];
+        let by_teacher = steps
+            .iter()
+            .filter(|record| record.action == record.teacher_action);
+        (by_teacher.count(), steps.len())
+    };
+    let (_, alone) = fly(None);
+    let (_, watched) = fly(Some(0.0));
+    assert!(alone.iter().all(|record| record.teacher_action == [0.0; 2]));
+    assert!(
+        watched
+            .iter()
+            .any(|record| record.teacher_action != [0.0; 2])
+    );
+    let actions = |records: &[Box<TransitionRecord>]| -> Vec<_> {
+        records.iter().map(|record| record.action).collect()
+    };
+    assert_eq!(actions(&alone), actions(&watched));
+    assert_eq!(flown_by_teacher(&watched).0, 0);
+    let (outcome, taught) = fly(Some(1.0));
+    let (by_teacher, steps) = flown_by_teacher(&taught);
+    assert_eq!((outcome, by_teacher), (Outcome::ReachedEnd, steps));
+    let (_, both) = fly(Some(0.5));
+    let (by_teacher, steps) = flown_by_teacher(&both);
+    assert!(
+        by_teacher > 0 && by_teacher < steps,
+        "{by_teacher} of {steps}"
+    );
 }
 
 #[test]

@@ -10,10 +10,13 @@ use super::{
 
 /// Distance flown at 1 m/s until a sidestep has settled, metres: three time constants of the
 /// slowest vehicle (0.9 s) plus half its length.
-const SETTLING_M: f32 = 3.2;
+pub(super) const SETTLING_M: f32 = 3.2;
+
+/// Least room for the openings of a random course that the drone can reach, metres.
+pub(super) const NEAR_MIDDLE_M: f32 = 0.5;
 
 /// Largest length accepted for any key, metres.
-const LARGEST_M: f32 = 1000.0;
+pub(super) const LARGEST_M: f32 = 1000.0;
 
 pub(super) fn corridor_and_start(course: &Course) -> Result<(), CourseFault> {
     let corridor = course.corridor;
@@ -74,7 +77,8 @@ pub(super) fn wall_count(count: usize) -> Result<(), CourseFault> {
 fn wall(course: &Course, candidate: WallLayout) -> Result<Wall, CourseFault> {
     let label = candidate.label;
     let least_m = course.start.offset_m + BODY_CLEARANCE_M;
-    let most_m = course.corridor.length_m - course.wall_thickness_m - DRONE_WIDTH_M;
+    // A tilted drone must leave the last wall before it touches the end.
+    let most_m = course.corridor.length_m - course.wall_thickness_m - 2.0 * BODY_CLEARANCE_M;
     // Written so that a NaN is refused as well.
     if !(least_m..=most_m).contains(&candidate.x_m) {
         return Err(CourseFault::OutsideCorridor {
@@ -165,7 +169,14 @@ fn sizes(wall: WallLabel, candidate: &WallLayout) -> Result<(), CourseFault> {
 fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, CourseFault> {
     let wall = candidate.label;
     let outline = candidate.opening.outline();
-    if let Some(edges) = polygon::self_intersection(&outline) {
+    if let Some((first, second)) = polygon::self_intersection(&outline) {
+        // The outline of corners listed clockwise runs the other way round.
+        let count = outline.len();
+        let edges = match polygon::signed_area(&candidate.opening.shape.corners()) < 0.0 {
+            true => [second, first].map(|edge| (2 * count - 2 - edge) % count),
+            false => [first, second],
+        };
+        let edges = (edges[0].min(edges[1]), edges[0].max(edges[1]));
         return Err(CourseFault::SelfIntersecting { wall, edges });
     }
     let limit_y_m = course.corridor.width_m / 2.0 - FRAME_M;
@@ -189,6 +200,14 @@ fn outline(course: &Course, candidate: &WallLayout) -> Result<Vec<[f32; 2]>, Cou
 /// the start area.
 fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
     let previous = course.walls.last();
+    if let Some(previous) = previous.filter(|previous| wall.x_m <= previous.x_m) {
+        return Err(CourseFault::NotBehind {
+            wall: wall.label,
+            x_m: wall.x_m,
+            previous: previous.label,
+            previous_x_m: previous.x_m,
+        });
+    }
     let start = course.start;
     let behind_m = previous.map_or(0.0, |previous| previous.x_m);
     let from_start = (
@@ -216,6 +235,51 @@ fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
         }
     }
     Ok(())
+}
+
+/// Returns the ranges `[least, most]` along y and z within which the drone can reach the safe point
+/// of a wall at `x_m`, from the previous wall and from the start area. They may be empty.
+pub(super) fn in_reach(course: &Course, x_m: f32) -> [[f32; 2]; 2] {
+    let (start, previous) = (course.start, course.walls.last());
+    let behind_m = previous.map_or(0.0, |previous| previous.x_m);
+    let free_m = x_m - behind_m - start.offset_m - SETTLING_M;
+    let middle_m = course.corridor.height_m / 2.0;
+    let (along_y_m, along_z_m) = (free_m - start.jitter_y_m, free_m - start.jitter_z_m);
+    let mut ranges = [
+        [-along_y_m, along_y_m],
+        [middle_m - along_z_m, middle_m + along_z_m],
+    ];
+    if let Some(previous) = previous {
+        let free_m = x_m - previous.x_m - course.wall_thickness_m - SETTLING_M;
+        for ([least, most], from_m) in ranges.iter_mut().zip(previous.safe_point) {
+            *least = least.max(from_m - free_m);
+            *most = most.min(from_m + free_m);
+        }
+    }
+    ranges
+}
+
+/// Checks that a wall at `next_x_m` can have an opening that the drone reaches from the last wall
+/// and from the start area.
+pub(super) fn leads_on(course: &Course, next_x_m: f32) -> Result<(), CourseFault> {
+    let (Some(last), ranges) = (course.walls.last(), in_reach(course, next_x_m)) else {
+        return Ok(());
+    };
+    let room_m = ranges
+        .map(|[least, most]| most - least)
+        .into_iter()
+        .fold(f32::INFINITY, f32::min);
+    if room_m >= NEAR_MIDDLE_M {
+        return Ok(());
+    }
+    let gap_m = next_x_m - last.x_m - course.wall_thickness_m;
+    let missing_m = NEAR_MIDDLE_M - room_m;
+    Err(CourseFault::TooClose {
+        wall: WallLabel(last.label.0 + 1),
+        gap_m,
+        shift_m: gap_m - SETTLING_M + missing_m,
+        needed_m: gap_m + missing_m,
+    })
 }
 
 fn in_range(

@@ -157,6 +157,21 @@ pub enum CourseFault {
         /// Largest position accepted, metres.
         most_m: f32,
     },
+    /// The wall stands before the one that it follows.
+    #[error(
+        "wall {wall}: key wall_x_m = {x_m} m is not behind wall {previous} at {previous_x_m} m: \
+         list the places in ascending order"
+    )]
+    NotBehind {
+        /// The wall.
+        wall: WallLabel,
+        /// Its front face, metres.
+        x_m: f32,
+        /// The wall that it follows.
+        previous: WallLabel,
+        /// Front face of the previous wall, metres.
+        previous_x_m: f32,
+    },
     /// The wall is too close behind the previous one for the sidestep between the openings.
     #[error(
         "wall {wall}: key wall_x_m leaves {gap_m:.2} m before it, but the drone must move \

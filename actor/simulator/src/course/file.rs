@@ -13,7 +13,7 @@ use super::{
     Corridor, Course, CourseFault, CourseLayout, FaultLocation, Opening, Shape, StartArea,
     WallLabel, WallLayout,
 };
-use crate::text::{exactly, message_of, parse_whole, read_text};
+use crate::text::{exactly, fits_in_a_table, message_of, parse_whole, read_text};
 
 /// Reason why a course file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -86,7 +86,7 @@ fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CourseError
         location,
         key,
     } = SourceLocation::of(error.span().unwrap_or_default(), text);
-    let problem = message_of(error);
+    let problem = message_of(text, error);
     let message = match key {
         Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
         _ => problem,
@@ -147,10 +147,7 @@ enum ShapeName {
 
 impl CourseFile {
     fn layout(self) -> Result<CourseLayout, CourseFault> {
-        if self
-            .name
-            .contains(|sign: char| sign.is_control() || sign == '|')
-        {
+        if !fits_in_a_table(&self.name) {
             return Err(CourseFault::Name { name: self.name });
         }
         if self.order.len() != self.wall_x_m.len() {

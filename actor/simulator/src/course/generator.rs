@@ -5,10 +5,17 @@
 //! drawn radius fits inside, for any shape.
 
 mod corners;
+mod layout;
+#[cfg(test)]
+mod tests;
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
+
+pub use layout::LayoutRanges;
+
+use layout::Layout;
 
 use super::{
     BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel,
@@ -40,6 +47,10 @@ pub struct GeneratorRanges {
     /// Rotation of an opening, degrees. Default −180 to 180.
     #[serde(deserialize_with = "exactly")]
     pub rotation_deg: [f32; 2],
+    /// Ranges for the corridor and its walls. They replace `corridor`, `start`, `wall_x_m` and
+    /// `wall_thickness_m`, which then keep their defaults. Default: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub layout: Option<LayoutRanges>,
 }
 
 /// A family of openings that the generator draws.
@@ -136,10 +147,10 @@ impl GeneratedShape {
 /// Reason why no course can be drawn from ranges.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RangesError {
-    /// A range with reversed bounds, or with a bound that is not finite or too small.
+    /// A range with reversed bounds, or with a bound that is too small or too large.
     #[error(
-        "generator: {key} = [{least}, {most}] must be a least and a largest value, both at least \
-         {smallest}"
+        "generator: {key} = [{least}, {most}] must be a least and a largest value from {smallest} \
+         to {largest}"
     )]
     NoRange {
         /// The key.
@@ -150,6 +161,17 @@ pub enum RangesError {
         most: f32,
         /// Smallest lower bound accepted.
         smallest: f32,
+        /// Largest upper bound accepted.
+        largest: f32,
+    },
+    /// A key of a fixed corridor beside ranges of corridors.
+    #[error(
+        "generator: {key} and layout exclude each other: remove {key}, or the section layout and \
+         its keys"
+    )]
+    LayoutTwice {
+        /// The key of the fixed corridor.
+        key: &'static str,
     },
     /// No families of openings.
     #[error("generator: shapes is empty: name at least one")]
@@ -179,6 +201,7 @@ impl Default for GeneratorRanges {
             shapes: GeneratedShape::TRAINED.to_vec(),
             clearance_m: [0.9, 1.15],
             rotation_deg: [-180.0, 180.0],
+            layout: None,
         }
     }
 }
@@ -189,24 +212,41 @@ impl Course {
     /// # Errors
     /// [`RangesError`] if the ranges are invalid, or if no course drawn from them can be flown.
     pub fn generate(seed: u64, ranges: &GeneratorRanges) -> Result<Self, RangesError> {
+        Self::generate_from_level(seed, 1, ranges)
+    }
+
+    /// Generates the course of a seed and a start level. It has a wall for that level, if the
+    /// ranges allow as many walls.
+    ///
+    /// # Errors
+    /// Like [`Course::generate`].
+    pub fn generate_from_level(
+        seed: u64,
+        level: u8,
+        ranges: &GeneratorRanges,
+    ) -> Result<Self, RangesError> {
         ranges.validate()?;
+        let layout = ranges.draw_layout(seed, level);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut course = Self::without_walls(
             format!("generated {seed}"),
-            ranges.corridor,
-            ranges.start,
-            ranges.wall_thickness_m,
+            layout.corridor,
+            layout.start,
+            layout.wall_thickness_m,
         )?;
-        for &x_m in &ranges.wall_x_m {
-            course.add_random_wall(x_m, ranges, &mut rng)?;
+        let next = layout.wall_x_m.iter().copied().map(Some).skip(1);
+        for (&x_m, next_x_m) in layout.wall_x_m.iter().zip(next.chain([None])) {
+            course.add_random_wall(x_m, next_x_m, ranges, &mut rng)?;
         }
         Ok(course)
     }
 
-    /// Draws walls until one can be flown after those already in the course.
+    /// Draws walls until one can be flown after those already in the course, and leaves room for
+    /// the wall at `next_x_m`.
     fn add_random_wall(
         &mut self,
         x_m: f32,
+        next_x_m: Option<f32>,
         ranges: &GeneratorRanges,
         rng: &mut impl Rng,
     ) -> Result<(), RangesError> {
@@ -216,12 +256,12 @@ impl Course {
         let label = WallLabel(self.walls.len() as u32 + 1);
         let mut retries = 0;
         loop {
-            let opening = ranges.draw_opening(rng);
-            match self.add_wall(WallLayout {
+            let layout = WallLayout {
                 label,
                 x_m,
-                opening,
-            }) {
+                opening: ranges.draw_opening(self, x_m, rng),
+            };
+            match self.add_wall_before(layout, next_x_m) {
                 Ok(()) => return Ok(()),
                 Err(last) if retries == MOST_RETRIES => {
                     return Err(RangesError::NothingFits { wall: label, last });
@@ -230,45 +270,143 @@ impl Course {
             }
         }
     }
+
+    /// Adds a wall if a wall at `next_x_m` can follow it.
+    fn add_wall_before(
+        &mut self,
+        layout: WallLayout,
+        next_x_m: Option<f32>,
+    ) -> Result<(), CourseFault> {
+        self.add_wall(layout)?;
+        let followed = next_x_m.map_or(Ok(()), |x_m| check::leads_on(self, x_m));
+        if followed.is_err() {
+            self.walls.pop();
+        }
+        followed
+    }
 }
 
 impl GeneratorRanges {
+    /// Checks that courses can be drawn: not only usual ones, but some of the narrowest corridors
+    /// with the closest walls. An actor would otherwise fail in the middle of a run.
+    ///
+    /// # Errors
+    /// [`RangesError`] names the key or the wall.
+    pub fn check(&self) -> Result<(), RangesError> {
+        const HARDEST: std::ops::Range<u64> = 0..8;
+        Course::generate(0, self)?;
+        let Some(layout) = &self.layout else {
+            return Ok(());
+        };
+        let hardest = Self {
+            layout: Some(layout.hardest()),
+            ..self.clone()
+        };
+        HARDEST
+            .into_iter()
+            .try_for_each(|seed| Course::generate(seed, &hardest).map(drop))
+    }
+
+    /// Returns the longest corridor of a course, and the start that lies farthest from its end.
+    #[must_use]
+    pub fn longest(&self) -> (Corridor, StartArea) {
+        match &self.layout {
+            Some(layout) => layout.longest(),
+            None => (self.corridor, self.start),
+        }
+    }
+
+    /// Returns the most walls of a course.
+    #[must_use]
+    pub fn most_walls(&self) -> usize {
+        match &self.layout {
+            Some(layout) => layout.walls[1].into(),
+            None => self.wall_x_m.len(),
+        }
+    }
+
     fn validate(&self) -> Result<(), RangesError> {
         check::wall_count(self.wall_x_m.len())?;
         if self.shapes.is_empty() {
             return Err(RangesError::NoShapes);
         }
-        let ranges = [
-            ("clearance_m", self.clearance_m, BODY_CLEARANCE_M),
-            ("rotation_deg", self.rotation_deg, -360.0),
-        ];
-        for (key, [least, most], smallest) in ranges {
-            let sound = least >= smallest && most >= least && most.is_finite();
-            if !sound {
-                return Err(RangesError::NoRange {
-                    key,
-                    least,
-                    most,
-                    smallest,
-                });
+        check_range("clearance_m", self.clearance_m, BODY_CLEARANCE_M, 50.0)?;
+        check_range("rotation_deg", self.rotation_deg, -360.0, 360.0)?;
+        let Some(layout) = &self.layout else {
+            return Ok(());
+        };
+        let usual = Self::default();
+        for (key, is_set) in [
+            ("corridor", self.corridor != usual.corridor),
+            ("start", self.start != usual.start),
+            ("wall_x_m", self.wall_x_m != usual.wall_x_m),
+            (
+                "wall_thickness_m",
+                self.wall_thickness_m != usual.wall_thickness_m,
+            ),
+        ] {
+            if is_set {
+                return Err(RangesError::LayoutTwice { key });
             }
         }
-        Ok(())
+        layout.validate()
     }
 
-    fn draw_opening(&self, rng: &mut impl Rng) -> Opening {
+    /// Draws from a generator of its own, so that the openings of a seed do not depend on whether
+    /// corridors vary.
+    fn draw_layout(&self, seed: u64, level: u8) -> Layout {
+        match &self.layout {
+            Some(layout) => layout.draw(level, &mut Pcg64Mcg::seed_from_u64(!seed)),
+            None => Layout {
+                corridor: self.corridor,
+                start: self.start,
+                wall_x_m: self.wall_x_m.clone(),
+                wall_thickness_m: self.wall_thickness_m,
+            },
+        }
+    }
+
+    /// Draws an opening for the next wall of `course`, where the drone can reach it.
+    fn draw_opening(&self, course: &Course, x_m: f32, rng: &mut impl Rng) -> Opening {
         let kind = self.shapes[rng.random_range(0..self.shapes.len())];
         let clearance_m = rng.random_range(self.clearance_m[0]..=self.clearance_m[1]);
-        let (half_y, height) = (self.corridor.width_m / 2.0, self.corridor.height_m);
+        let shape = kind.draw(clearance_m, rng);
+        let (half_y, height) = (course.corridor.width_m / 2.0, course.corridor.height_m);
+        let [in_reach_y, in_reach_z] = check::in_reach(course, x_m);
+        // A shape's safe point may lie beside its centre, but not farther than its free space.
+        let mut within = |[least, most]: [f32; 2], [near, far]: [f32; 2]| {
+            let (least, most) = (least.max(near - clearance_m), most.min(far + clearance_m));
+            rng.random_range(least..=most.max(least))
+        };
         Opening {
-            shape: kind.draw(clearance_m, rng),
+            shape,
             centre_m: [
-                rng.random_range(-half_y..=half_y),
-                rng.random_range(0.0..=height),
+                within([-half_y, half_y], in_reach_y),
+                within([0.0, height], in_reach_z),
             ],
             rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
         }
     }
+}
+
+/// Checks the range `key` against its bounds.
+fn check_range(
+    key: &'static str,
+    [least, most]: [f32; 2],
+    smallest: f32,
+    largest: f32,
+) -> Result<(), RangesError> {
+    // Written so that a NaN is refused as well.
+    if least >= smallest && most >= least && most <= largest {
+        return Ok(());
+    }
+    Err(RangesError::NoRange {
+        key,
+        least,
+        most,
+        smallest,
+        largest,
+    })
 }
 
 impl GeneratedShape {
@@ -319,96 +457,5 @@ impl GeneratedShape {
             Self::Crescent => corners::crescent(rng),
             Self::U => corners::u(rng),
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_family_is_drawn_with_exactly_the_configured_free_space() {
-        let held_out = [&GeneratedShape::HELD_OUT[..], &GeneratedShape::UNTRIED].concat();
-        for shape in GeneratedShape::TRAINED.into_iter().chain(held_out) {
-            for clearance_m in [BODY_CLEARANCE_M + 0.01, 0.75, 1.0] {
-                let ranges = GeneratorRanges {
-                    shapes: vec![shape],
-                    clearance_m: [clearance_m; 2],
-                    ..Default::default()
-                };
-                for seed in 0..10 {
-                    let course = Course::generate(seed, &ranges).unwrap();
-                    for wall in course.walls() {
-                        // The widest circle is computed to a millimetre.
-                        let off_m = (wall.clearance_m() - clearance_m).abs();
-                        assert!(off_m < 0.003, "{shape:?}: {} m", wall.clearance_m());
-                    }
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn no_trained_family_is_held_out_and_defaults_draw_no_held_out_family() {
-        let held_out = [&GeneratedShape::HELD_OUT[..], &GeneratedShape::UNTRIED].concat();
-        let is_held_out = |shape: &GeneratedShape| held_out.contains(shape);
-        assert!(!GeneratedShape::TRAINED.iter().any(is_held_out));
-        assert!(!GeneratorRanges::default().shapes.iter().any(is_held_out));
-    }
-
-    #[test]
-    fn every_seed_gives_a_course_with_the_configured_free_space() {
-        let ranges = GeneratorRanges::default();
-        let mut outlines = Vec::new();
-        for seed in 0..40 {
-            let course = Course::generate(seed, &ranges).unwrap();
-            assert_eq!(course.walls().len(), 5);
-            for wall in course.walls() {
-                assert!(
-                    (0.89..=1.16).contains(&wall.clearance_m()),
-                    "{}",
-                    wall.clearance_m()
-                );
-            }
-            outlines.push(course.walls()[0].outline().to_vec());
-        }
-        outlines.dedup();
-        assert_eq!(outlines.len(), 40, "different seeds give different courses");
-    }
-
-    #[test]
-    fn the_same_seed_gives_the_same_course() {
-        let ranges = GeneratorRanges::default();
-        assert_eq!(Course::generate(3, &ranges), Course::generate(3, &ranges));
-    }
-
-    #[test]
-    fn impossible_ranges_are_refused_and_say_why() {
-        let upside_down = GeneratorRanges {
-            clearance_m: [1.2, 1.0],
-            ..Default::default()
-        };
-        let error = Course::generate(0, &upside_down).unwrap_err().to_string();
-        assert!(error.contains("clearance_m = [1.2, 1]"), "{error}");
-
-        let no_corridor = GeneratorRanges {
-            corridor: Corridor {
-                width_m: f32::NAN,
-                ..Corridor::default()
-            },
-            ..Default::default()
-        };
-        let error = Course::generate(0, &no_corridor).unwrap_err().to_string();
-        assert!(error.contains("corridor.width_m = NaN"), "{error}");
-
-        let too_wide = GeneratorRanges {
-            clearance_m: [3.5, 3.5],
-            ..Default::default()
-        };
-        let error = Course::generate(0, &too_wide).unwrap_err().to_string();
-        assert!(
-            error.contains("no opening drawn for wall 1") && error.contains("must stay within"),
-            "{error}"
-        );
     }
 }

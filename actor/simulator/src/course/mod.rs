@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 pub use fault::{CourseFault, FaultLocation, NoSuchLevel};
 pub use file::CourseError;
-pub use generator::{GeneratedShape, GeneratorRanges, RangesError};
+pub use generator::{GeneratedShape, GeneratorRanges, LayoutRanges, RangesError};
 pub(crate) use mesh::{Mesh, MeshSurface, SurfaceKind};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
 
@@ -257,6 +257,15 @@ impl Course {
     #[must_use]
     pub fn walls(&self) -> &[Wall] {
         &self.walls
+    }
+
+    /// Returns the number of walls whose back face lies before `x_m`. With `x_m` of the drone's
+    /// tail, these are the walls that it has left.
+    pub(crate) fn walls_before(&self, x_m: f32) -> usize {
+        self.walls
+            .iter()
+            .take_while(|wall| wall.x_m + self.wall_thickness_m < x_m)
+            .count()
     }
 
     /// Returns the number of start levels: one before each wall.

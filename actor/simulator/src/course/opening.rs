@@ -170,7 +170,7 @@ impl Shape {
     }
 
     /// Returns the corners relative to the centre.
-    fn corners(&self) -> Vec<[f32; 2]> {
+    pub(crate) fn corners(&self) -> Vec<[f32; 2]> {
         match *self {
             Self::Rectangle { width_m, height_m } => {
                 let (y, z) = (width_m / 2.0, height_m / 2.0);

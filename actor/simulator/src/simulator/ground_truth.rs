@@ -3,15 +3,11 @@
 use crate::course::{Course, Wall};
 use crate::vehicle::VehicleState;
 
-/// Distance from the drone's centre to its tail plus a margin, m. A wall is behind the drone once
-/// the tail has left the opening.
-const TAIL_M: f32 = 0.6;
-
 /// Facts about a moment that the camera does not show: for the critic in training, never for the
 /// policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// Openings of the next two walls that the drone has not left entirely.
+    /// Openings of the next two walls that the drone's tail has not left.
     pub ahead: [OpeningAhead; 2],
     /// Position left and up from the middle of the corridor, m.
     pub from_middle_m: [f32; 2],
@@ -23,6 +19,8 @@ pub struct GroundTruth {
     pub latency_periods: f32,
     /// The gust's force in the world frame: forward, left, up, N.
     pub gust_n: [f32; 3],
+    /// Half the corridor's width and height, m.
+    pub half_section_m: [f32; 2],
 }
 
 /// An opening relative to the drone. Behind the last wall, the end wall stands for an opening as
@@ -39,7 +37,7 @@ pub struct OpeningAhead {
 
 impl GroundTruth {
     /// Length of [`Self::numbers`].
-    pub const NUMBERS: usize = 16;
+    pub const NUMBERS: usize = 18;
 
     /// Returns all fields as numbers, in their order.
     #[must_use]
@@ -49,6 +47,7 @@ impl GroundTruth {
             [ahead.distance_m, left, up, ahead.clearance_m]
         });
         let [left, up] = self.from_middle_m;
+        let [half_width, half_height] = self.half_section_m;
         let [gust_x, gust_y, gust_z] = self.gust_n;
         let rest = [
             left,
@@ -59,6 +58,8 @@ impl GroundTruth {
             gust_x,
             gust_y,
             gust_z,
+            half_width,
+            half_height,
         ];
         let mut numbers = [0.0; Self::NUMBERS];
         numbers[..4].copy_from_slice(&next);
@@ -69,9 +70,14 @@ impl GroundTruth {
 }
 
 impl OpeningAhead {
-    /// Returns the next two openings, seen from the drone.
-    pub(super) fn next_two(course: &Course, state: &VehicleState) -> [Self; 2] {
-        let mut walls = walls_ahead(course, state).map(|wall| Self::of_wall(wall, state));
+    /// Returns the next two openings behind `walls_behind` walls, seen from the drone.
+    pub(super) fn next_two(
+        course: &Course,
+        walls_behind: usize,
+        state: &VehicleState,
+    ) -> [Self; 2] {
+        let walls = &course.walls()[walls_behind..];
+        let mut walls = walls.iter().map(|wall| Self::of_wall(wall, state));
         let mut next = || walls.next().unwrap_or_else(|| Self::of_end(course, state));
         [next(), next()]
     }
@@ -97,18 +103,6 @@ impl OpeningAhead {
     }
 }
 
-/// Returns the walls that the drone has not left entirely, the next one first.
-pub(crate) fn walls_ahead<'a>(
-    course: &'a Course,
-    state: &VehicleState,
-) -> impl Iterator<Item = &'a Wall> {
-    let tail_m = state.position_m.x - TAIL_M;
-    course
-        .walls()
-        .iter()
-        .filter(move |wall| wall.x_m() + course.wall_thickness_m() > tail_m)
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Point3;
@@ -122,7 +116,7 @@ mod tests {
         let walls = course.walls();
         let [y_m, z_m] = walls[0].safe_point();
         let before = VehicleState::at_rest(Point3::new(walls[0].x_m() - 4.0, y_m - 1.0, z_m + 0.5));
-        let [next, after] = OpeningAhead::next_two(&course, &before);
+        let [next, after] = OpeningAhead::next_two(&course, 0, &before);
         assert_eq!(
             (next.distance_m, next.clearance_m),
             (4.0, walls[0].clearance_m())
@@ -133,27 +127,14 @@ mod tests {
         assert!((behind_first - expected).abs() < 1e-5);
 
         let last = walls.last().unwrap();
-        let behind_all = last.x_m() + course.wall_thickness_m() + TAIL_M;
+        let behind_all = last.x_m() + course.wall_thickness_m() + 0.5;
         let behind = VehicleState::at_rest(Point3::new(behind_all, 1.0, 2.0));
-        let [next, after] = OpeningAhead::next_two(&course, &behind);
+        let [next, after] = OpeningAhead::next_two(&course, walls.len(), &behind);
         assert_eq!(next, after);
         assert_eq!(next.distance_m, course.corridor().length_m - behind_all);
         assert_eq!(
             next.offset_m,
             [-1.0, course.corridor().height_m / 2.0 - 2.0]
         );
-    }
-
-    #[test]
-    fn a_wall_is_ahead_until_the_tail_has_left_it() {
-        let course = test_course();
-        let wall = &course.walls()[0];
-        let tail_leaves = wall.x_m() + course.wall_thickness_m() + TAIL_M;
-        let first = |x_m| {
-            let state = VehicleState::at_rest(Point3::new(x_m, 0.0, 1.0));
-            walls_ahead(&course, &state).next().map(Wall::label)
-        };
-        assert_eq!(first(tail_leaves - 0.01), Some(wall.label()));
-        assert_ne!(first(tail_leaves + 0.01), Some(wall.label()));
     }
 }

@@ -7,6 +7,8 @@
 
 mod error;
 mod ground_truth;
+#[cfg(test)]
+mod passing_tests;
 mod reach;
 mod settings;
 #[cfg(test)]
@@ -18,7 +20,6 @@ use nalgebra::Vector3;
 use rand::Rng;
 
 pub use error::{SimulationError, SimulatorError};
-pub(crate) use ground_truth::walls_ahead;
 pub use ground_truth::{GroundTruth, OpeningAhead};
 pub use reach::OutOfReach;
 pub use settings::SimulatorSettings;
@@ -28,6 +29,7 @@ pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
 use crate::disturbances::{CommandDelay, DisturbanceSettings, DrawnDisturbances, Gust};
+use crate::oracle;
 use crate::vehicle::{Vehicle, VehicleState};
 use crate::world::{Contact, World};
 
@@ -53,7 +55,7 @@ pub struct Simulator {
 struct EpisodeState {
     phase: EpisodePhase,
     steps: u32,
-    /// Walls whose back face the drone's centre has left behind, including those before its start.
+    /// Walls that the drone's tail has left, including those before its start.
     walls_behind: usize,
     walls_behind_at_start: usize,
     /// The drone's mass relative to its nominal mass.
@@ -146,7 +148,7 @@ impl Simulator {
         } else {
             0
         });
-        let walls_behind = self.walls_behind(position_m.x);
+        let walls_behind = self.walls_left();
         self.episode = EpisodeState {
             phase: EpisodePhase::Flying,
             steps: 0,
@@ -212,6 +214,15 @@ impl Simulator {
         self.world.state()
     }
 
+    /// Returns the oracle's action `[v_y, v_z]` for the current moment, m/s in the heading frame,
+    /// each in [-1, 1].
+    #[must_use]
+    pub fn oracle_action(&self) -> [f32; 2] {
+        let hold_m = self.world.tail_x_m() - oracle::HOLD_M;
+        let walls_behind = self.course.walls_before(hold_m);
+        oracle::action(&self.course, walls_behind, &self.state())
+    }
+
     /// Returns the ground truth of the current moment, which the camera does not show.
     #[must_use]
     pub fn ground_truth(&self) -> GroundTruth {
@@ -219,7 +230,7 @@ impl Simulator {
         let corridor = self.course.corridor();
         let [x_m, y_m, z_m] = state.position_m.coords.into();
         GroundTruth {
-            ahead: OpeningAhead::next_two(&self.course, &state),
+            ahead: OpeningAhead::next_two(&self.course, self.walls_left(), &state),
             from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
             to_end_m: corridor.length_m - x_m,
             mass_factor: self.episode.mass_factor,
@@ -228,6 +239,7 @@ impl Simulator {
                 .gust
                 .as_ref()
                 .map_or([0.0; 3], |gust| gust.force_n().into()),
+            half_section_m: [corridor.width_m / 2.0, corridor.height_m / 2.0],
         }
     }
 
@@ -241,7 +253,10 @@ impl Simulator {
     /// Returns the number of walls passed in this episode so far.
     #[must_use]
     pub fn walls_passed(&self) -> u8 {
-        (self.episode.walls_behind - self.episode.walls_behind_at_start) as u8
+        let episode = &self.episode;
+        episode
+            .walls_behind
+            .saturating_sub(episode.walls_behind_at_start) as u8
     }
 
     /// Returns the course.
@@ -272,17 +287,27 @@ impl Simulator {
             if self.world.is_quarantined() {
                 return Err(self.abort("the body's pose or velocity"));
             }
-            // A passed wall stays passed, even if a gust blows the drone back.
-            self.episode.walls_behind = self
-                .episode
-                .walls_behind
-                .max(self.walls_behind(self.world.position_x_m()));
-            match self.world.contact() {
-                Contact::Nothing => {}
-                contact => return Ok(contact),
+            let contact = self.world.contact();
+            self.count_walls(contact);
+            if contact != Contact::Nothing {
+                return Ok(contact);
             }
         }
         Ok(Contact::Nothing)
+    }
+
+    /// Counts the walls passed after a physics step that ended with `contact`.
+    fn count_walls(&mut self, contact: Contact) {
+        let passed = self.episode.walls_behind;
+        self.episode.walls_behind = match contact {
+            // A passed wall stays passed if a gust blows the drone back without a collision.
+            Contact::Nothing | Contact::EndWall => passed.max(self.walls_left()),
+            // No episode passes a wall and hits it, not even one that is blown back into it.
+            Contact::Obstacle => self
+                .world
+                .touched_wall()
+                .map_or(passed, |hit| hit.min(passed)),
+        };
     }
 
     fn outcome(&self, contact: Contact) -> Option<EpisodeOutcome> {
@@ -305,14 +330,9 @@ impl Simulator {
         }
     }
 
-    /// Returns the number of walls whose back face lies before `x_m`.
-    fn walls_behind(&self, x_m: f32) -> usize {
-        let thickness_m = self.course.wall_thickness_m();
-        self.course
-            .walls()
-            .iter()
-            .take_while(|wall| wall.x_m() + thickness_m < x_m)
-            .count()
+    /// Returns the number of walls that the whole body is clear of.
+    fn walls_left(&self) -> usize {
+        self.course.walls_before(self.world.tail_x_m())
     }
 
     fn abort(&mut self, what: &'static str) -> SimulationError {

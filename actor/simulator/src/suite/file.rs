@@ -8,7 +8,7 @@ use serde::Deserialize;
 use super::{EntryCourses, MOST_EPISODES, MOST_WALLS_TO_ORDER, Suite, SuiteEntry, orders};
 use crate::course::{Course, CourseError, CourseFault, GeneratorRanges, RangesError};
 use crate::disturbances::DisturbanceSettings;
-use crate::text::{message_of, parse_whole, read_text};
+use crate::text::{first_repeated, fits_in_a_table, message_of, parse_whole, read_text};
 
 /// Most entries of a suite.
 const MOST_ENTRIES: usize = 64;
@@ -40,8 +40,19 @@ pub enum SuiteError {
         /// Entries found.
         count: usize,
     },
+    /// A name that cannot be shown.
+    #[error(
+        "{}: name = {name:?} cannot be shown: give one line without |, not empty",
+        path.display()
+    )]
+    Name {
+        /// The file.
+        path: PathBuf,
+        /// The name found.
+        name: String,
+    },
     /// An entry cannot be flown.
-    #[error("{}: entry \"{entry}\": {source}", path.display())]
+    #[error("{}: entry {entry:?}: {source}", path.display())]
     Entry {
         /// The file.
         path: PathBuf,
@@ -55,6 +66,9 @@ pub enum SuiteError {
 /// Reason why an entry of a suite cannot be flown.
 #[derive(Debug, thiserror::Error)]
 pub enum SuiteEntryError {
+    /// The name cannot be shown in a table.
+    #[error("its name cannot be shown in a table: give one line without |, not empty")]
+    Name,
     /// Another entry has the same name.
     #[error("another entry has this name: give each entry its own name")]
     RepeatedName,
@@ -72,6 +86,9 @@ pub enum SuiteEntryError {
     /// Neither the entry nor the suite has a number of episodes.
     #[error("has no episodes, and neither has the suite: add episodes to one of them")]
     NoEpisodes,
+    /// `max_steps = 0`.
+    #[error("max_steps = 0: an episode needs at least one step")]
+    NoSteps,
     /// A course file cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
@@ -100,6 +117,9 @@ pub enum SuiteEntryError {
     /// No course can be generated.
     #[error(transparent)]
     Ranges(#[from] RangesError),
+    /// A shape of generated courses is listed twice.
+    #[error("generated.shapes lists {0:?} twice: name each shape once")]
+    RepeatedShape(&'static str),
 }
 
 /// Contents of a suite file.
@@ -123,6 +143,8 @@ struct EntryTable {
     orders_of: Option<PathBuf>,
     generated: Option<GeneratorRanges>,
     first_seed: Option<u64>,
+    /// Step limit of the entry's episodes, if not the policy's own.
+    max_steps: Option<u32>,
     #[serde(default)]
     disturbances: DisturbanceSettings,
 }
@@ -158,6 +180,12 @@ impl Suite {
                 count: file.entry.len(),
             });
         }
+        if !names(&file.name) {
+            return Err(SuiteError::Name {
+                path: path.to_owned(),
+                name: file.name,
+            });
+        }
         let folder = path.parent().unwrap_or(Path::new(""));
         let mut suite = Self {
             name: file.name,
@@ -184,6 +212,9 @@ impl Suite {
         episodes: Option<u64>,
         folder: &Path,
     ) -> Result<SuiteEntry, SuiteEntryError> {
+        if !names(&table.name) {
+            return Err(SuiteEntryError::Name);
+        }
         if self.entries.iter().any(|entry| entry.name == table.name) {
             return Err(SuiteEntryError::RepeatedName);
         }
@@ -194,13 +225,22 @@ impl Suite {
         if !(1..=MOST_EPISODES).contains(&episodes) {
             return Err(SuiteEntryError::Episodes(episodes));
         }
+        if table.max_steps == Some(0) {
+            return Err(SuiteEntryError::NoSteps);
+        }
         Ok(SuiteEntry {
             episodes,
             courses: courses(&table, folder)?,
             disturbances: table.disturbances,
+            max_steps: table.max_steps,
             name: table.name,
         })
     }
+}
+
+/// Returns `true` if a suite or an entry can be called `name`.
+fn names(name: &str) -> bool {
+    !name.trim().is_empty() && fits_in_a_table(name)
 }
 
 fn courses(table: &EntryTable, folder: &Path) -> Result<EntryCourses, SuiteEntryError> {
@@ -213,8 +253,11 @@ fn courses(table: &EntryTable, folder: &Path) -> Result<EntryCourses, SuiteEntry
         )?)])),
         (None, Some(file), None) => all_orders(&folder.join(file)).map(EntryCourses::Listed),
         (None, None, Some(ranges)) => {
+            if let Some(shape) = first_repeated(&ranges.shapes) {
+                return Err(SuiteEntryError::RepeatedShape(shape.name()));
+            }
             let first_seed = table.first_seed.unwrap_or(0);
-            // The first course shows any fault of the ranges.
+            ranges.check()?;
             Course::generate(first_seed, ranges)?;
             Ok(EntryCourses::Generated {
                 first_seed,
@@ -254,7 +297,7 @@ fn all_orders(path: &Path) -> Result<Vec<Arc<Course>>, SuiteEntryError> {
 
 /// Returns the parser's error on one line; its own text takes several.
 fn syntax_message(text: &str, error: &toml::de::Error) -> String {
-    let message = message_of(error);
+    let message = message_of(text, error);
     let Some(place) = error.span() else {
         return message;
     };

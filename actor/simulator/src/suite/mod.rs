@@ -41,6 +41,20 @@ pub struct SuiteEntry {
     pub courses: EntryCourses,
     /// Disturbances of the episodes.
     pub disturbances: DisturbanceSettings,
+    /// Step limit of the episodes; `None` for the policy's own.
+    pub max_steps: Option<u32>,
+}
+
+impl SuiteEntry {
+    /// Returns the settings `of_policy`, with the entry's disturbances and step limit.
+    #[must_use]
+    pub fn settings(&self, of_policy: &SimulatorSettings) -> SimulatorSettings {
+        SimulatorSettings {
+            disturbances: self.disturbances.clone(),
+            max_steps: self.max_steps.unwrap_or(of_policy.max_steps),
+            ..of_policy.clone()
+        }
+    }
 }
 
 /// Courses of an entry. Episode n flies course n; after the last course, the first follows again.
@@ -77,7 +91,10 @@ impl EntryCourses {
             Self::Listed(courses) => courses
                 .iter()
                 .try_for_each(|course| settings.check_reach(course.corridor(), course.start())),
-            Self::Generated { ranges, .. } => settings.check_reach(ranges.corridor, ranges.start),
+            Self::Generated { ranges, .. } => {
+                let (corridor, start) = ranges.longest();
+                settings.check_reach(corridor, start)
+            }
         }
     }
 

@@ -47,9 +47,9 @@ fn a_suite_is_used_whole_or_refused() {
 }
 
 #[test]
-fn the_generalist_suite_has_six_thousand_episodes() {
+fn the_generalist_suite_has_seven_thousand_episodes() {
     let suite = generalist();
-    assert_eq!(suite.entries.len(), 6);
+    assert_eq!(suite.entries.len(), 7);
     assert!(suite.entries.iter().all(|entry| entry.episodes == 1000));
     let disturbed: Vec<_> = suite
         .entries
@@ -187,6 +187,30 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_entry_and_key() {
         (
             of_entry("course = \"../courses/training.toml\"\nepisodes = 0"),
             "episodes = 0 is outside",
+        ),
+        (
+            of_entry("generated.shapes = [\"circle\", \"cross\", \"circle\"]"),
+            "generated.shapes lists \"circle\" twice",
+        ),
+        (
+            of_entry("[entry.generated]\n[[entry]]\nname = \"\\u001b[2J\""),
+            "entry \"\\u{1b}[2J\": its name cannot be shown",
+        ),
+        (
+            of_entry("[entry.generated]\n[[entry]]\nname = \" \""),
+            "entry \" \": its name cannot be shown",
+        ),
+        (
+            refusal("name = \"a\\tb\"\nepisodes = 2\n[[entry]]\nname = \"one\"\ngenerated = {}"),
+            "name = \"a\\tb\" cannot be shown",
+        ),
+        (
+            of_entry("generated = {}\nfirst_seed = 9223372036854775808"),
+            "line 6: `first_seed` = 9223372036854775808 is outside",
+        ),
+        (
+            of_entry("generated = {}\nfirst_seed = 0xffff_ffff_ffff_ffff"),
+            "line 6: `first_seed` = 0xffff_ffff_ffff_ffff is outside",
         ),
         (
             of_entry("generated.clearance_m = [0.3, 0.3]"),

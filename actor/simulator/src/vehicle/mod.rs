@@ -3,7 +3,7 @@
 //! Three presets share one interface. `airsim` and `hummingbird` are quadrotors: their controller
 //! turns a velocity command into tilt, tilt into torques, and torques into rotor thrust. `point`
 //! follows the command with a first-order lag. Nothing here integrates motion: rapier does, in
-//! `world.rs`.
+//! `body.rs`.
 
 mod airframe;
 mod controller;
@@ -55,8 +55,21 @@ impl VehicleState {
     /// Returns the velocity in the heading frame, m/s: x where the nose points, y left of it, z up.
     /// A real drone can measure it.
     pub fn heading_velocity_mps(&self) -> Vector3<f32> {
-        let (_, _, yaw) = self.world_from_body.euler_angles();
-        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -yaw) * self.velocity_mps
+        let [i, j, k, w]: [f32; 4] = self.world_from_body.coords.into();
+        // Where the nose points, seen from above: no angle is needed.
+        let (along, beside) = (1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j + w * k));
+        let level = (along * along + beside * beside).sqrt();
+        if level == 0.0 {
+            // The nose points straight up or down.
+            return self.velocity_mps;
+        }
+        let (cos, sin) = (along / level, beside / level);
+        let velocity = self.velocity_mps;
+        Vector3::new(
+            cos * velocity.x + sin * velocity.y,
+            cos * velocity.y - sin * velocity.x,
+            velocity.z,
+        )
     }
 }
 

@@ -3,8 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
+use serde::Serialize;
 use skein_protocol::config::Config;
 use skein_simulator::suite::MOST_EPISODES;
+use skein_simulator::text::{first_repeated, fits_in_a_table};
+use toml::Value;
 
 use super::file::{ArmFile, ExperimentFile, as_overrides, names_folder};
 use super::{Arm, DefinitionError, Experiment, FlownSuite, MOST_ARMS, Measure, TableKind};
@@ -198,12 +201,20 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
             "is empty: write what the experiment shall find out",
         );
     }
-    if file.question.contains('\n') || file.question.contains("<!--") {
+    if file.question.contains(char::is_control) || file.question.contains("<!--") {
         return refuse(
             "question",
             &format!("{:?}", file.question),
-            "cannot be a report's heading: write one line without <!--",
+            "cannot be a report's heading: write one line without control characters and <!--",
         );
+    }
+    if let Some(kind) = first_repeated(&file.tables) {
+        let twice = "is listed twice: name each table once";
+        return refuse("tables", &as_written(kind), twice);
+    }
+    if let Some(curve) = first_repeated(&file.curves) {
+        let twice = "is listed twice: name each curve once";
+        return refuse("curves", &as_written(curve), twice);
     }
     if file.paper_episodes == Some(0) {
         return refuse(
@@ -228,15 +239,13 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
                 "cannot name a folder: begin with a letter or digit, \
                       use only letters, digits, -, _ and ., and not {REPORT}"
             );
-            return refuse("arm.name", &arm.name, &problem);
+            return refuse("arm.name", &format!("{:?}", arm.name), &problem);
         }
-        if arm.label.trim().is_empty()
-            || arm.label.contains(['|', '\n'])
-            || arm.label.contains("<!--")
+        if arm.label.trim().is_empty() || !fits_in_a_table(&arm.label) || arm.label.contains("<!--")
         {
             return refuse(
                 "arm.label",
-                &arm.label,
+                &format!("{:?}", arm.label),
                 "cannot be shown in a table: write one line without | and <!--",
             );
         }
@@ -256,6 +265,11 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
         }
     }
     Ok(())
+}
+
+/// Returns `value` as it stands in the file.
+fn as_written(value: &impl Serialize) -> String {
+    Value::try_from(value).map_or_else(|error| error.to_string(), |value| value.to_string())
 }
 
 /// Refuses arms that are evaluated differently.

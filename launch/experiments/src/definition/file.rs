@@ -4,7 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
-use skein_protocol::config::FILE_KEYS;
+use skein_protocol::config::{FILE_KEYS, integer_too_large};
+use skein_protocol::files::{self, SETTINGS_BYTES};
 use toml::{Table, Value};
 
 use super::{CurveSpec, DefinitionError, TableKind};
@@ -116,13 +117,19 @@ fn known(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
 }
 
 pub(super) fn read(path: &Path) -> Result<ExperimentFile, DefinitionError> {
-    let text = fs::read_to_string(path).map_err(|source| DefinitionError::Read {
+    let text = files::read_text(path, SETTINGS_BYTES).map_err(|source| DefinitionError::Read {
         path: path.to_owned(),
         source,
     })?;
-    parse_whole(&text).map_err(|source| DefinitionError::Syntax {
-        path: path.to_owned(),
-        source: Box::new(source),
+    parse_whole(&text).map_err(|source| match integer_too_large(&text, &source) {
+        Some(problem) => DefinitionError::Integer {
+            path: path.to_owned(),
+            problem,
+        },
+        None => DefinitionError::Syntax {
+            path: path.to_owned(),
+            source: Box::new(source),
+        },
     })
 }
 

@@ -10,7 +10,7 @@ mod tests;
 use std::fmt::{self, Display, Formatter};
 use std::path::{Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use skein_protocol::config::Config;
 
 use skein_prepare::PrepareError;
@@ -93,7 +93,7 @@ pub struct Arm {
 }
 
 /// A table of a report.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TableKind {
     /// R (share of walls passed) and completed courses of the best snapshot, per evaluation course.
@@ -112,7 +112,7 @@ pub enum TableKind {
 }
 
 /// A picture of a report, with one line per arm.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct CurveSpec {
     /// Quantity on the y axis.
@@ -122,7 +122,7 @@ pub struct CurveSpec {
 }
 
 /// Quantity of a curve, averaged over `evaluation.window_episodes` training episodes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
     /// Walls passed per episode.
@@ -134,7 +134,7 @@ pub enum Measure {
 }
 
 /// Quantity on a curve's x axis.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
     /// Training episodes.
@@ -189,6 +189,14 @@ pub enum DefinitionError {
         /// Position and reason.
         #[source]
         source: Box<toml::de::Error>,
+    },
+    /// An integer that TOML does not hold.
+    #[error("{}: {problem}", path.display())]
+    Integer {
+        /// The file.
+        path: PathBuf,
+        /// Line, key, value and remedy.
+        problem: String,
     },
     /// A value is not allowed.
     #[error("{}: {key} = {value} {problem}", path.display())]

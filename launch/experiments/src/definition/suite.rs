@@ -1,8 +1,8 @@
 //! Suite that the best snapshot of every run of an experiment flies after training.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
+use skein_protocol::files::{self, SETTINGS_BYTES};
 use skein_run::failure::with_causes;
 use skein_simulator::simulator::SimulatorSettings;
 use skein_simulator::suite::Suite;
@@ -33,16 +33,6 @@ impl FlownSuite {
         let mut suite = Suite::load(path).map_err(|error| with_causes(&error))?;
         for entry in &mut suite.entries {
             entry.episodes = each.unwrap_or(entry.episodes);
-        }
-        if let Some(entry) = suite
-            .entries
-            .iter()
-            .find(|entry| entry.name.contains(['|', '\n']))
-        {
-            return Err(format!(
-                "entry {:?} cannot be shown in a table: name it in one line without |",
-                entry.name
-            ));
         }
         let stem = path.file_stem().unwrap_or_default().to_string_lossy();
         let each_in_name = each.map_or_else(String::new, |each| format!("-{each}"));
@@ -82,7 +72,7 @@ impl FlownSuite {
                 .disturbances
                 .validate(&settings.vehicle, settings.camera.range_m);
             flown.map_err(|fault| format!("entry \"{}\": {}", entry.name, with_causes(&fault)))?;
-            let reached = entry.courses.check_reach(&settings);
+            let reached = entry.courses.check_reach(&entry.settings(&settings));
             reached.map_err(|fault| format!("entry \"{}\": {fault}", entry.name))?;
         }
         Ok(())
@@ -106,7 +96,8 @@ fn checksum(path: &Path) -> Result<u32, String> {
 }
 
 fn content(path: &Path) -> Result<Table, String> {
-    let text = fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    let text = files::read_text(path, SETTINGS_BYTES)
+        .map_err(|error| format!("{}: {error}", path.display()))?;
     text.parse()
         .map_err(|error| format!("{}: {error}", path.display()))
 }

@@ -298,7 +298,7 @@ fn an_invalid_experiment_is_refused_with_file_key_value_and_remedy() {
         (
             head().replace("What for?", "<!-- end -->") + ARM,
             None,
-            vec!["cannot be a report's heading", "without <!--"],
+            vec!["cannot be a report's heading", "and <!--"],
         ),
         (
             format!("paper_episodes = 0\n{}{ARM}", head()),
@@ -318,22 +318,55 @@ fn an_invalid_experiment_is_refused_with_file_key_value_and_remedy() {
         (
             head() + &ARM.replace("\"a\"", "\"../a\""),
             None,
-            vec!["arm.name = ../a", "letter or digit"],
+            vec!["arm.name = \"../a\"", "letter or digit"],
         ),
         (
             head() + &ARM.replace("\"a\"", "\"report\""),
             None,
-            vec!["arm.name = report"],
+            vec!["arm.name = \"report\""],
         ),
         (
             head() + &ARM.replace("\"A\"", "\"a|b\""),
             None,
-            vec!["arm.label = a|b", "without |"],
+            vec!["arm.label = \"a|b\"", "without |"],
         ),
         (
             head() + &ARM.replace("\"A\"", "\"<!-- end -->\""),
             None,
-            vec!["arm.label = <!-- end -->", "without | and <!--"],
+            vec!["arm.label = \"<!-- end -->\"", "without | and <!--"],
+        ),
+        (
+            head() + &ARM.replace("\"A\"", "\"\\u001b[2J\""),
+            None,
+            vec!["arm.label = \"\\u{1b}[2J\"", "one line"],
+        ),
+        (
+            head() + &ARM.replace("\"a\"", "\"\\u001b\""),
+            None,
+            vec!["arm.name = \"\\u{1b}\"", "letter or digit"],
+        ),
+        (
+            head().replace("What for?", "\\u0007") + ARM,
+            None,
+            vec!["question = \"\\u{7}\"", "control characters"],
+        ),
+        (
+            head().replace("[\"evaluation\"]", "[\"cost\", \"learning\", \"cost\"]") + ARM,
+            None,
+            vec!["tables = \"cost\" is listed twice", "once"],
+        ),
+        (
+            head().replace(
+                "curves = [",
+                "curves = [{ over = \"steps\", measure = \"return\" }, ",
+            ) + ARM,
+            None,
+            vec!["curves = { measure = \"return\", over = \"steps\" } is listed twice"],
+        ),
+        (
+            format!("seeds = 18446744073709551615\n{}{ARM}", head()),
+            None,
+            vec!["test.toml: line 1: seeds = 18446744073709551615 is an integer outside"],
         ),
         (
             with_arm("settings.run.sed = 1"),

@@ -13,8 +13,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::definition::Experiment;
-use super::plan::{ExperimentPlan, REPORT, RunState};
-use super::results::{ResultError, RunResult};
+use super::plan::{ExperimentPlan, REPORT};
+use super::results::RunResult;
 use super::statistics::Bootstrap;
 use runs::RUNS;
 use skein_reports::ReportError;
@@ -42,11 +42,8 @@ pub struct Findings<'a> {
 #[derive(Debug, thiserror::Error)]
 pub enum ExperimentReportError {
     /// No run is complete.
-    #[error("no run in {} is complete: there is nothing to report yet", .0.display())]
+    #[error("no run in {} is complete and can be read: there is nothing to report", .0.display())]
     Nothing(PathBuf),
-    /// The results of a run cannot be read.
-    #[error(transparent)]
-    Result(#[from] ResultError),
     /// A picture cannot be drawn.
     #[error(transparent)]
     Picture(#[from] ReportError),
@@ -121,12 +118,9 @@ impl Findings<'_> {
         })
     }
 
-    /// Returns `true` if every run is complete.
+    /// Returns `true` if every run is complete and its results were read.
     pub fn is_whole(&self) -> bool {
-        self.plan
-            .runs
-            .iter()
-            .all(|run| run.state == RunState::Complete)
+        self.results.len() == self.plan.runs.len()
     }
 
     /// Returns the complete runs of the arm with this index.

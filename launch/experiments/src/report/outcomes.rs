@@ -130,6 +130,7 @@ mod tests {
     fn episodes_of_all_seeds_are_counted_where_they_ended() {
         let score = |walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
+            walls: 2,
             episode_return: 0.0,
             outcome,
             hit_wall,
@@ -137,7 +138,6 @@ mod tests {
         let seeds = [
             CourseEvaluation::of(
                 "c",
-                2,
                 &[
                     score(2, Outcome::ReachedEnd, None),
                     score(1, Outcome::Collided, Some(2)),
@@ -145,7 +145,6 @@ mod tests {
             ),
             CourseEvaluation::of(
                 "c",
-                2,
                 &[
                     score(2, Outcome::Collided, None),
                     score(0, Outcome::TimedOut, None),

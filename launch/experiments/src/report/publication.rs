@@ -4,6 +4,8 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use skein_protocol::files::{self, REPORT_BYTES};
+
 use super::runs::RUNS;
 use super::{Findings, Picture, WrittenReport};
 use crate::plan::REPORT;
@@ -69,7 +71,7 @@ impl Publication {
 
     /// Reads the present surroundings of the report; `None` if there is no document.
     fn surroundings(&self) -> Result<Option<Surroundings>, PublicationError> {
-        let text = match fs::read_to_string(&self.document) {
+        let text = match files::read_text(&self.document, REPORT_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(at(&self.document)(error)),

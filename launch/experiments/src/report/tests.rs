@@ -9,7 +9,7 @@ use skein_protocol::transition::Outcome;
 
 use super::*;
 use crate::definition::{Axis, CurveSpec, Measure, TableKind};
-use crate::plan::PlannedRun;
+use crate::plan::{PlannedRun, RunState};
 use crate::results;
 
 const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"completed",
@@ -23,6 +23,7 @@ const SUMMARY: &str = r#"{"skein_version":"0","run":7,"seed":1,"ending":"complet
 fn entry_result(entry: &str, completed: usize) -> CourseEvaluation {
     let score = |number: usize| EpisodeScore {
         walls_passed: if number < completed { 2 } else { 0 },
+        walls: 2,
         episode_return: 0.0,
         outcome: match number < completed {
             true => Outcome::ReachedEnd,
@@ -31,7 +32,7 @@ fn entry_result(entry: &str, completed: usize) -> CourseEvaluation {
         hit_wall: None,
     };
     let episodes: Vec<_> = (0..4).map(score).collect();
-    CourseEvaluation::of(entry, 2, &episodes)
+    CourseEvaluation::of(entry, &episodes)
 }
 
 fn leave(run: &PlannedRun, suite: &[CourseEvaluation]) {
@@ -92,6 +93,13 @@ fn runs(folder: &Path, more_arms: &str, calm: &[usize]) -> (Experiment, Experime
     (experiment, plan)
 }
 
+/// Returns the results of all complete runs.
+fn read(plan: &ExperimentPlan) -> Vec<RunResult> {
+    let (results, failures) = results::read(plan);
+    assert!(failures.is_empty(), "{failures:?}");
+    results
+}
+
 pub(super) fn findings<'a>(
     experiment: &'a Experiment,
     plan: &'a ExperimentPlan,
@@ -110,7 +118,7 @@ fn a_suite_has_a_row_per_entry_over_the_seeds() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, mut plan) = two_runs(folder.path());
     let report_text = |plan: &ExperimentPlan| {
-        let runs = results::read(plan).unwrap();
+        let runs = read(plan);
         let findings = findings(&experiment, plan, &runs);
         let tables = findings.tables(TableKind::Suite);
         assert!(
@@ -142,9 +150,35 @@ fn a_suite_has_a_row_per_entry_over_the_seeds() {
 
     let result = plan.runs[0].suite_json.clone().unwrap();
     fs::write(&result, "{").unwrap();
-    let error = results::read(&plan).unwrap_err().to_string();
+    // Nor does one whose suite result is damaged. It is named.
+    plan.runs[1].state = RunState::Complete;
+    let (results, failures) = results::read(&plan);
+    assert_eq!(results.iter().map(|run| run.seed).collect::<Vec<_>>(), [2]);
+    let [error] = &failures[..] else {
+        panic!("{failures:?}")
+    };
+    let error = error.to_string();
     assert!(
         error.contains(&result.display().to_string()) && error.contains("move this file away"),
+        "{error}"
+    );
+    let left = findings(&experiment, &plan, &results);
+    assert!(!left.is_whole());
+    let body = left.body(&[], "runs.csv");
+    assert!(body.contains("1 of 2 runs are complete"), "{body}");
+}
+
+#[test]
+fn a_run_whose_last_episode_is_cut_off_is_left_out_and_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, plan) = two_runs(folder.path());
+    let damaged = plan.runs[0].directory.episodes_csv();
+    fs::write(&damaged, "steps,walls_passed,return\n4,2,1.0\n4,2,").unwrap();
+    let (results, failures) = results::read(&plan);
+    assert_eq!((results.len(), failures.len()), (1, 1));
+    let error = failures[0].to_string();
+    assert!(
+        error.contains(&damaged.display().to_string()) && error.contains("cut off"),
         "{error}"
     );
 }
@@ -157,7 +191,7 @@ fn an_arm_is_compared_with_the_first_seed_by_seed() {
     let (experiment, mut plan) = runs(folder.path(), b, &[1, 2, 3, 4]);
     let compact = |line: &str| line.split_whitespace().collect::<Vec<_>>().join(" ");
     let lines = |plan: &ExperimentPlan, kind| {
-        let results = results::read(plan).unwrap();
+        let results = read(plan);
         let tables = findings(&experiment, plan, &results).tables(kind);
         let lines: Vec<_> = tables[0].table.lines().map(compact).collect();
         lines
@@ -182,7 +216,7 @@ fn an_arm_is_compared_with_the_first_seed_by_seed() {
             lines[4]
         );
     }
-    let results = results::read(&plan).unwrap();
+    let results = read(&plan);
     let body = findings(&experiment, &plan, &results).body(&[], "runs.csv");
     assert!(body.contains("A row \"difference to A\""), "{body}");
     // Without B's second run only the first seed is compared: no evidence about other seeds.
@@ -211,7 +245,7 @@ fn a_picture_that_cannot_be_drawn_costs_only_itself() {
     let report = plan.root.join(crate::plan::REPORT);
     // In the place of a picture.
     fs::create_dir_all(report.join("return_over_steps.png")).unwrap();
-    let results = results::read(&plan).unwrap();
+    let results = read(&plan);
     let written = findings(&experiment, &plan, &results).write().unwrap();
     let files: Vec<_> = written
         .pictures
@@ -234,7 +268,7 @@ fn runs_of_several_builds_are_marked() {
     let folder = tempfile::tempdir().unwrap();
     let (experiment, plan) = two_runs(folder.path());
     let report_text = || {
-        let runs = results::read(&plan).unwrap();
+        let runs = read(&plan);
         findings(&experiment, &plan, &runs).body(&[], "runs.csv")
     };
     let (one, several) = (report_text(), "**Several builds**");
@@ -263,7 +297,7 @@ fn every_run_has_its_own_row() {
     leave(&plan.runs[0], &[calm, entry_result("windy", 1)]);
     let learned = SUMMARY.replace(r#""policy_sha256":"""#, r#""policy_sha256":"ab""#);
     fs::write(plan.runs[1].directory.summary_json(), learned).unwrap();
-    let runs = results::read(&plan).unwrap();
+    let runs = read(&plan);
     let file = folder.path().join("runs.csv");
     findings(&experiment, &plan, &runs)
         .write_runs(&file)
@@ -328,7 +362,7 @@ fn learning_steadiness_and_cost_match_the_runs_files() {
         fs::write(run.directory.episodes_csv(), episodes(walls, steps)).unwrap();
         fs::write(run.directory.summary_json(), summary).unwrap();
     }
-    let runs = results::read(&plan).unwrap();
+    let runs = read(&plan);
     let findings = findings(&experiment, &plan, &runs);
     let row = |kind| {
         let table = findings.tables(kind)[0].table.clone();
@@ -404,7 +438,7 @@ fn learning_steadiness_and_cost_match_the_runs_files() {
 fn returns_with_different_rewards_are_not_tabulated() {
     let folder = tempfile::tempdir().unwrap();
     let (mut experiment, plan) = two_runs(folder.path());
-    let runs = results::read(&plan).unwrap();
+    let runs = read(&plan);
     let report_text = |experiment: &Experiment| {
         let tables = findings(experiment, &plan, &runs).tables(TableKind::Learning);
         tables[0].table.contains("return, last 2")

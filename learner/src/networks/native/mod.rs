@@ -8,4 +8,4 @@ mod rows;
 pub use critic::{CriticLayers, NativeCritic};
 pub use dense::{Dense, Layers, output, output_mut};
 pub use learned::{Learned, squared_norm};
-pub use rows::{ESTIMATES, follow, join, pair, smaller};
+pub use rows::{ESTIMATES, follow, join, pair, smaller, squash};

@@ -1,6 +1,6 @@
 //! Row operations that every actor-critic needs, and the step of a target network.
 
-use skein_kernels::{Isa, Team};
+use skein_kernels::{Isa, Team, exp};
 use skein_protocol::ACTION;
 
 /// Q estimates per row of a critic.
@@ -28,6 +28,17 @@ pub fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
     } else {
         other
     }
+}
+
+/// Returns tanh x and its derivative. With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its
+/// derivative 4 e / (1 + e)². Both stay exact where tanh saturates.
+#[inline(always)]
+pub fn squash(x: f32) -> [f32; 2] {
+    let e = exp(-2.0 * x.abs());
+    [
+        ((1.0 - e) / (1.0 + e)).copysign(x),
+        4.0 * e / ((1.0 + e) * (1.0 + e)),
+    ]
 }
 
 /// Moves a target network towards its leader, by the fraction `rate` of their difference.

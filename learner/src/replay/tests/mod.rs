@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{CRITIC_STATE, IMAGE_PIXELS};
+use skein_protocol::{CRITIC_STATE, GROUND_TRUTH, IMAGE_PIXELS};
 
 use super::*;
 use crate::episode::samples::{code, episode, shade, with_images};
@@ -82,6 +82,7 @@ fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode
                 .map_or([0.0; ACTION], |before| episode.actions[before]),
             observations: episode.observations[first..=end].to_vec(),
             actions: episode.actions[first..end].to_vec(),
+            teacher_actions: episode.teacher_actions[first..end].to_vec(),
             rewards: episode.rewards[first..end].to_vec(),
             reward_terms: episode.reward_terms[first..end].to_vec(),
             level_up: episode.level_up[first..end].to_vec(),
@@ -251,11 +252,15 @@ fn rows_of_a_minibatch_belong_together() {
         ] {
             let state = &states[index * CRITIC_STATE..][..CRITIC_STATE];
             assert_eq!(
-                state[17..19],
+                state[GROUND_TRUTH + 1..GROUND_TRUTH + 3],
                 seen[LATENT..LATENT + 2],
                 "the critic sees the same moment"
             );
-            assert_eq!(state[21..], seen[LATENT + 2..], "and the action before it");
+            assert_eq!(
+                state[GROUND_TRUTH + 5..],
+                seen[LATENT + 2..],
+                "and the action before it"
+            );
         }
         assert_eq!(
             batch.actions[2 * index..2 * index + 2],

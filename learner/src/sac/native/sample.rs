@@ -8,6 +8,8 @@ use std::f32::consts::LN_2;
 use skein_kernels::{Isa, exp};
 use skein_protocol::{ACTION, LOG_STD};
 
+use crate::networks::native::squash;
+
 /// Policy outputs per row: the means, then the logarithms of the standard deviations.
 const OUTPUTS: usize = 2 * ACTION;
 /// ½ ln 2π.
@@ -87,11 +89,8 @@ impl Sample {
                     let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
                     *deviation = exp(log_std) * noise;
                     let x = *mean + *deviation;
-                    // With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its derivative 4 e / (1 +
-                    // e)². Both stay exact where tanh saturates.
+                    [*action, *slope] = squash(x);
                     let e = exp(-2.0 * x.abs());
-                    *action = ((1.0 - e) / (1.0 + e)).copysign(x);
-                    *slope = 4.0 * e / ((1.0 + e) * (1.0 + e));
                     // log(1 - tanh²x) = 2 (ln 2 - x - softplus(-2x)) = 2 (ln 2 - |x| - ln(1 + e)).
                     let correction = 2.0 * (LN_2 - x.abs() - ln_1p(e));
                     *log_prob = -0.5 * noise * noise - log_std - HALF_LN_TAU - correction;

@@ -1,5 +1,6 @@
 //! Native against libtorch, number by number; neither threads nor instructions change a bit.
 
+use skein_protocol::config::TeacherName;
 use tch::Device;
 
 use super::super::TorchSac;
@@ -171,6 +172,32 @@ fn gradients_are_the_references_where_tanh_saturates_and_deviations_are_bounded(
     torch.load_named(&stored).unwrap();
     let transitions = Transitions::random(observation, 64, &mut Noise::new(1));
     assert_one_update_is_equal(&mut native, &mut torch, &transitions, "at the bounds");
+}
+
+#[test]
+fn the_teachers_gradient_is_the_references_and_fades() {
+    let teacher = TeacherSection {
+        policy: TeacherName::Oracle,
+        loss_weight: 5.0,
+        loss_updates: 2,
+        ..TeacherSection::default()
+    };
+    let inputs = Inputs::same(32);
+    let (native, torch) = both(&section(64), inputs, 3);
+    let (mut native, mut torch) = (native.with_teacher(&teacher), torch.with_teacher(&teacher));
+    let mut noise = Noise::new(3);
+    let taught = Transitions::random(32, 50, &mut noise).with_teacher();
+    assert_one_update_is_equal(&mut native, &mut torch, &taught, "with a teacher");
+    let metrics = native.update(&mut Team::new(1), taught.columns(), &mut Noise::new(9));
+    assert_eq!(metrics.unwrap().last().unwrap().0, Scalar::TeacherDistance);
+    // After the last of its updates, the teacher has no influence.
+    let mut untaught = NativeSac::new(&section(64), inputs, 3, Isa::best());
+    untaught.load_named(&native.named_tensors()).unwrap();
+    for sac in [&mut native, &mut untaught] {
+        sac.update(&mut Team::new(1), taught.columns(), &mut Noise::new(9))
+            .unwrap();
+    }
+    assert_eq!(native.named_tensors(), untaught.named_tensors());
 }
 
 #[test]

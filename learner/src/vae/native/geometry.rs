@@ -47,9 +47,9 @@ impl GeometryHead {
         }
     }
 
-    /// Computes the head's gradient, and adds the gradient with respect to the codes, `[n, latent]`,
-    /// to `codes_grad`. `known`: `[n, outputs]`, NaN where a number is unknown. Returns the weighted
-    /// squared error, summed over the outputs, mean over the batch.
+    /// Computes the head's gradient, and adds the gradient with respect to the codes, `[n,
+    /// latent]`, to `codes_grad`. `known`: `[n, outputs]`, NaN where a number is unknown. Returns
+    /// the weighted squared error, summed over the outputs, mean over the batch.
     pub(super) fn add_gradient(
         &mut self,
         team: &mut Team,

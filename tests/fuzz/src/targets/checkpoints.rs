@@ -91,6 +91,7 @@ fn state() -> CheckpointState {
                 epoch: 2,
                 policy_version: 1,
                 exploration: Exploration::Sample,
+                teacher_share: None,
                 keep: KeptData::Depth,
             }],
             latest_candidate: Some(5),

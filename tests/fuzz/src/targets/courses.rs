@@ -318,5 +318,6 @@ fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
             .collect(),
         clearance_m,
         rotation_deg,
+        layout: None,
     }
 }

@@ -51,6 +51,7 @@ pub(super) fn sample_ticket(episode: u64) -> Ticket {
         start_level: 1,
         exploration: Exploration::Sample,
         seed: episode,
+        teacher_share: None,
         segment: None,
     }
 }

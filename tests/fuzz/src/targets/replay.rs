@@ -142,6 +142,7 @@ pub(super) fn episode() -> CommittedEpisode {
         action_before: [0.0; ACTION],
         observations: vec![seen; 3],
         actions: vec![[0.0; ACTION]; 2],
+        teacher_actions: vec![[0.0; ACTION]; 2],
         rewards: vec![1.0; 2],
         reward_terms: vec![[0.0; REWARD_TERMS]; 2],
         level_up: vec![false, true],

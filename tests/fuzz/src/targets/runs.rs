@@ -113,6 +113,7 @@ fn identity(bytes: &[u8]) -> ReaderDecision {
 fn result_samples() -> Vec<Vec<u8>> {
     let scores = [EpisodeScore {
         walls_passed: 3,
+        walls: 5,
         episode_return: -1.5,
         outcome: Outcome::Collided,
         hit_wall: Some(4),
@@ -120,7 +121,7 @@ fn result_samples() -> Vec<Vec<u8>> {
     let report = EvaluationReport {
         policy_version: PolicyVersion(80),
         policy_sha256: "1024266715d59141".to_owned(),
-        courses: vec![CourseEvaluation::of("training", 5, &scores)],
+        courses: vec![CourseEvaluation::of("training", &scores)],
     };
     // Constant rather than generated: it lists all possible fields, and a reader that knows fewer
     // of them must read it too.

@@ -208,17 +208,29 @@ fn an_opening_beyond_the_frame_is_refused() {
 
 #[test]
 fn a_polygon_that_crosses_itself_is_refused() {
-    let bow_tie =
-        "shape = \"polygon\"\npoints_m = [[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]]\n";
-    let text = bow_tie.to_owned() + "centre_m = [0.0, 3.0]";
-    let message = refusal(
-        "shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2",
-        &text,
-    );
-    assert_says(
-        &message,
-        &["wall 7", "crosses or touches itself (edges 1 and 3)"],
-    );
+    // The larger loop of a bow tie decides on its direction. The third point of each leads to the
+    // fourth across the first edge.
+    for (points, edges) in [
+        (
+            "[-1.5, -1.5], [1.5, 1.5], [1.5, -1.5], [-1.5, 1.5]",
+            "1 and 3",
+        ),
+        (
+            "[-1.5, -1.5], [1.5, 1.5], [1.5, -0.5], [-0.5, 0.5], [-1.5, 0.5]",
+            "1 and 3",
+        ),
+        (
+            "[-1.5, 1.5], [1.5, -1.5], [1.5, 0.5], [-0.5, -0.5], [-1.5, -0.5]",
+            "1 and 3",
+        ),
+    ] {
+        let message = refusal(
+            "shape = \"circle\"\ncentre_m = [-1.0, 4.0]\ndiameter_m = 2.2",
+            &format!("shape = \"polygon\"\npoints_m = [{points}]\ncentre_m = [0.0, 3.0]"),
+        );
+        let crosses = format!("crosses or touches itself (edges {edges})");
+        assert_says(&message, &["wall 7", &crosses]);
+    }
 }
 
 #[test]
@@ -233,7 +245,11 @@ fn walls_too_close_or_outside_are_refused() {
     );
     assert_says(
         &refusal("[10.0, 20.0]", "[20.0, 10.0]"),
-        &["wall 4", "wall_x_m"],
+        &[
+            "wall 4",
+            "wall_x_m = 10 m is not behind wall 7 at 20 m",
+            "ascending",
+        ],
     );
 }
 

@@ -24,6 +24,7 @@ use skein_protocol::summary::RunSummary;
 use skein_run::RunDirectory;
 use skein_run::failure::with_causes;
 use skein_run::note;
+use skein_run::signals::survive_file_size_limit;
 
 use cost::CheckpointCost;
 use plan::{DisturbanceCounts, Subject};
@@ -154,6 +155,7 @@ impl Arguments {
 }
 
 fn main() -> ExitCode {
+    survive_file_size_limit();
     match run(&Arguments::parse()) {
         Ok(TestOutcome::Passed) => ExitCode::SUCCESS,
         Ok(TestOutcome::Failed) => ExitCode::FAILURE,

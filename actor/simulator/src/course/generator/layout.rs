@@ -1,0 +1,190 @@
+//! Ranges for the corridor of a random course, and for where its walls stand.
+
+use rand::{Rng, RngExt};
+use serde::{Deserialize, Serialize};
+
+use super::{RangesError, check_range};
+use crate::course::check::{LARGEST_M, NEAR_MIDDLE_M, SETTLING_M};
+use crate::course::{BODY_CLEARANCE_M, Corridor, MAX_WALLS, StartArea};
+use crate::text::exactly;
+
+/// Ranges for corridors: section `[simulator.generator.layout]`. Every key has a least and a
+/// largest value, drawn uniformly. Without the section, every course has the generator's
+/// `corridor`, `start`, `wall_x_m` and `wall_thickness_m`. The defaults here give that same
+/// corridor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LayoutRanges {
+    /// Width of the corridor, metres. Default 6.
+    #[serde(deserialize_with = "exactly")]
+    pub width_m: [f32; 2],
+    /// Height of the corridor, metres. Default 7.
+    #[serde(deserialize_with = "exactly")]
+    pub height_m: [f32; 2],
+    /// Number of walls. An episode from a later level has at least a wall for that level. Default
+    /// 5.
+    #[serde(deserialize_with = "exactly")]
+    pub walls: [u8; 2],
+    /// Distance from one wall's front face to the next one's, and from the corridor's start to the
+    /// first wall, metres; drawn for each wall. Default 10.
+    #[serde(deserialize_with = "exactly")]
+    pub spacing_m: [f32; 2],
+    /// Thickness of a course's walls, metres. Default 0.3.
+    #[serde(deserialize_with = "exactly")]
+    pub wall_thickness_m: [f32; 2],
+    /// Distance from the last wall's front face to the end wall, metres. Default 10.
+    #[serde(deserialize_with = "exactly")]
+    pub end_m: [f32; 2],
+    /// `start.offset_m` of a course. Default 1.5.
+    #[serde(deserialize_with = "exactly")]
+    pub start_offset_m: [f32; 2],
+    /// `start.jitter_y_m` of a course. Default 0.5.
+    #[serde(deserialize_with = "exactly")]
+    pub start_jitter_y_m: [f32; 2],
+    /// `start.jitter_z_m` of a course. Default 0.5.
+    #[serde(deserialize_with = "exactly")]
+    pub start_jitter_z_m: [f32; 2],
+}
+
+impl Default for LayoutRanges {
+    fn default() -> Self {
+        Self {
+            width_m: [6.0; 2],
+            height_m: [7.0; 2],
+            walls: [5; 2],
+            spacing_m: [10.0; 2],
+            wall_thickness_m: [0.3; 2],
+            end_m: [10.0; 2],
+            start_offset_m: [1.5; 2],
+            start_jitter_y_m: [0.5; 2],
+            start_jitter_z_m: [0.5; 2],
+        }
+    }
+}
+
+/// A corridor without openings.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Layout {
+    pub(super) corridor: Corridor,
+    pub(super) start: StartArea,
+    pub(super) wall_x_m: Vec<f32>,
+    pub(super) wall_thickness_m: f32,
+}
+
+impl LayoutRanges {
+    /// Checks that any corridor drawn from the ranges has openings that can be flown.
+    pub(super) fn validate(&self) -> Result<(), RangesError> {
+        let [least_walls, most_walls] = self.walls.map(f32::from);
+        let thickest_m = self.wall_thickness_m[1];
+        let widest_jitter_m = self.start_jitter_y_m[1].max(self.start_jitter_z_m[1]);
+        let before_wall_m = self.start_offset_m[1] + widest_jitter_m + SETTLING_M + NEAR_MIDDLE_M;
+        let jitter_m = |section_m: [f32; 2]| section_m[0] / 2.0 - BODY_CLEARANCE_M;
+        for (key, range, smallest, largest) in [
+            ("layout.width_m", self.width_m, 2.0, 100.0),
+            ("layout.height_m", self.height_m, 2.0, 100.0),
+            (
+                "layout.walls",
+                [least_walls, most_walls],
+                1.0,
+                MAX_WALLS as f32,
+            ),
+            ("layout.wall_thickness_m", self.wall_thickness_m, 0.01, 2.0),
+            (
+                "layout.start_offset_m",
+                self.start_offset_m,
+                thickest_m + BODY_CLEARANCE_M,
+                LARGEST_M,
+            ),
+            (
+                "layout.start_jitter_y_m",
+                self.start_jitter_y_m,
+                0.0,
+                jitter_m(self.width_m),
+            ),
+            (
+                "layout.start_jitter_z_m",
+                self.start_jitter_z_m,
+                0.0,
+                jitter_m(self.height_m),
+            ),
+            (
+                "layout.end_m",
+                self.end_m,
+                thickest_m + 2.0 * BODY_CLEARANCE_M,
+                LARGEST_M,
+            ),
+            (
+                "layout.spacing_m",
+                self.spacing_m,
+                before_wall_m.max(thickest_m + SETTLING_M + NEAR_MIDDLE_M),
+                (LARGEST_M - self.end_m[1]) / most_walls,
+            ),
+        ] {
+            check_range(key, range, smallest, largest)?;
+        }
+        Ok(())
+    }
+
+    /// Draws a corridor with at least `least_walls` walls, but not more than the ranges allow.
+    pub(super) fn draw(&self, least_walls: u8, rng: &mut impl Rng) -> Layout {
+        let mut draw = |[least, most]: [f32; 2]| rng.random_range(least..=most);
+        let (width_m, height_m) = (draw(self.width_m), draw(self.height_m));
+        let start = StartArea {
+            offset_m: draw(self.start_offset_m),
+            jitter_y_m: draw(self.start_jitter_y_m),
+            jitter_z_m: draw(self.start_jitter_z_m),
+        };
+        let (wall_thickness_m, end_m) = (draw(self.wall_thickness_m), draw(self.end_m));
+        let [least, most] = self.walls;
+        let walls = rng.random_range(least.max(least_walls).min(most)..=most);
+        let mut front_m = 0.0;
+        let wall_x_m: Vec<f32> = (0..walls)
+            .map(|_| {
+                front_m += rng.random_range(self.spacing_m[0]..=self.spacing_m[1]);
+                front_m
+            })
+            .collect();
+        Layout {
+            corridor: Corridor {
+                length_m: front_m + end_m,
+                width_m,
+                height_m,
+            },
+            start,
+            wall_x_m,
+            wall_thickness_m,
+        }
+    }
+
+    /// Returns the ranges of the corridor whose openings are the hardest to place: the narrowest
+    /// one with the most walls, closest together.
+    pub(super) fn hardest(&self) -> Self {
+        let [least, most] = [0, 1].map(|end| move |range: [f32; 2]| [range[end]; 2]);
+        Self {
+            width_m: least(self.width_m),
+            height_m: least(self.height_m),
+            walls: [self.walls[1]; 2],
+            spacing_m: least(self.spacing_m),
+            wall_thickness_m: most(self.wall_thickness_m),
+            end_m: least(self.end_m),
+            start_offset_m: most(self.start_offset_m),
+            start_jitter_y_m: most(self.start_jitter_y_m),
+            start_jitter_z_m: most(self.start_jitter_z_m),
+        }
+    }
+
+    /// Returns the longest corridor, and the start that lies farthest from its end.
+    pub(super) fn longest(&self) -> (Corridor, StartArea) {
+        let corridor = Corridor {
+            length_m: f32::from(self.walls[1]) * self.spacing_m[1] + self.end_m[1],
+            width_m: self.width_m[1],
+            height_m: self.height_m[1],
+        };
+        let start = StartArea {
+            offset_m: self.start_offset_m[0],
+            jitter_y_m: self.start_jitter_y_m[1],
+            jitter_z_m: self.start_jitter_z_m[1],
+        };
+        (corridor, start)
+    }
+}
