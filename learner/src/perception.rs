@@ -40,7 +40,8 @@ impl Perception {
     /// after it.
     pub(crate) fn describe(critic: &mut Layout, latent: usize) -> Self {
         let encoder = ImageEncoder::describe(critic, latent);
-        // A critic that sees no difference trains nothing. (arXiv:1910.01741 uses orthogonal weights.)
+        // A critic that sees no difference trains nothing. (arXiv:1910.01741 uses orthogonal
+        // weights.)
         critic.widen_weights(WIDER);
         Self {
             encoder,

@@ -41,8 +41,8 @@ pub struct Viewpoints {
     noisy_share: f32,
 }
 
-/// Openings ahead of a viewpoint, if their safe point is in sight and within the camera's range: the
-/// next wall's, and that of the wall behind it.
+/// Openings ahead of a viewpoint, if their safe point is in sight and within the camera's range:
+/// the next wall's, and that of the wall behind it.
 pub type OpeningsInSight = [Option<OpeningAhead>; 2];
 
 impl Viewpoints {

@@ -10,9 +10,9 @@ use tch::{Device, Tensor, no_grad_guard};
 
 use crate::noise::Noise;
 
-/// Factor by which an encoder's initial weights may exceed PyTorch's defaults. It keeps the variance
-/// of activations constant through layers with ReLU (He et al. 2015, arXiv:1502.01852, eq. 10). With
-/// the defaults, four layers shrink the difference between two images thirtyfold.
+/// Factor by which an encoder's initial weights may exceed PyTorch's defaults. It keeps the
+/// variance of activations constant through layers with ReLU (He et al. 2015, arXiv:1502.01852,
+/// eq. 10). With the defaults, four layers shrink the difference between two images thirtyfold.
 pub(crate) const WIDER: f32 = 2.449_489_7; // √6
 
 /// Name, shape and initial range of one tensor of a network.

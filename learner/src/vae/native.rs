@@ -77,8 +77,8 @@ impl NativeVae {
         Self::with_isa(section, run_seed, threads, Isa::best())
     }
 
-    /// Returns an untrained VAE with a second head, which regresses `outputs` numbers from the code.
-    /// `weight`: factor of its squared error in the loss.
+    /// Returns an untrained VAE with a second head, which regresses `outputs` numbers from the
+    /// code. `weight`: factor of its squared error in the loss.
     ///
     /// The encoder's initial weights are wider than the defaults: with those, the head learns
     /// nothing in the first hundreds of steps.
