@@ -3,11 +3,9 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use anyhow::Context;
 use clap::Parser;
-use signal_hook::consts::{SIGINT, SIGTERM};
 use skein_actor::service::{ExitReason, Service};
 use skein_kernels::Isa;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
@@ -18,7 +16,7 @@ use skein_run::allocation::return_large_blocks;
 use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::note;
-use skein_run::signals::{is_ignored, survive_file_size_limit};
+use skein_run::signals::{end_on_signal, survive_file_size_limit};
 use skein_run::{Presence, RunDirectory};
 use skein_simulator::camera::InstructionSet;
 use tracing::{error, info};
@@ -63,7 +61,7 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
-    let exit_requested = end_on_signal()?;
+    let exit_requested = end_on_signal().context("cannot listen for SIGTERM and SIGINT")?;
     let directory = RunDirectory::new(&arguments.run);
     let (identity, config) = directory.open()?;
     // The process that chose the number holds the claim to it.
@@ -90,20 +88,4 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
         Agent::new(config.observation_layout()),
     );
     Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
-}
-
-/// Returns a flag that the first SIGTERM or SIGINT sets; a second one ends the process at once. One
-/// that was ignored when this process started stays ignored.
-fn end_on_signal() -> anyhow::Result<Arc<AtomicBool>> {
-    let exit_requested = Arc::new(AtomicBool::new(false));
-    for signal in [SIGTERM, SIGINT] {
-        if is_ignored(signal) {
-            continue;
-        }
-        // In this order: the second signal finds the flag set by the first.
-        signal_hook::flag::register_conditional_default(signal, Arc::clone(&exit_requested))
-            .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&exit_requested)))
-            .context("cannot listen for SIGTERM and SIGINT")?;
-    }
-    Ok(exit_requested)
 }

@@ -56,8 +56,8 @@ pub(crate) fn next_look(flown: usize) -> usize {
 /// by passing all further walls it would not, or it passed significantly fewer walls than the best
 /// in the same episodes.
 ///
-/// The second test compares the sum of differences with the root of their sum of squares. With no
-/// real difference, it stops one candidate in 200.
+/// The second test compares the sum of differences with the root of their sum of squares. If that
+/// ratio is about normal, each look stops one in 200 of the candidates that equal the best.
 pub(crate) fn may_replace(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
     /// Standard errors between candidate and best.
     const SIGNIFICANT: f64 = 2.6;
@@ -67,10 +67,8 @@ pub(crate) fn may_replace(candidate: &BestSnapshot, best: Option<&BestSnapshot>)
     let flown = &candidate.confirmed;
     let further = best.confirmed.iter().skip(flown.len());
     let mut most = candidate.clone();
-    most.confirmed.extend(further.map(|walls| EpisodeWalls {
-        passed: walls.of,
-        ..*walls
-    }));
+    most.confirmed
+        .extend(further.map(|&EpisodeWalls { of, .. }| EpisodeWalls { passed: of, of }));
     let differences = flown
         .iter()
         .zip(&best.confirmed)

@@ -26,7 +26,7 @@ pub(crate) fn imitate(
         .zip(grad.chunks_exact_mut(OUTPUTS));
     for ((outputs, grad), teacher) in means.zip(teacher_actions.chunks_exact(ACTION)) {
         for ((&mean, grad), teacher) in outputs.iter().zip(grad).zip(teacher) {
-            let [action, slope] = squash(mean);
+            let [action, slope, _] = squash(mean);
             let error = action - teacher;
             distance += f64::from(error * error);
             *grad += 2.0 * share * error * slope;

@@ -233,13 +233,21 @@ fn checkpoint_bytes(config: &Config) -> u64 {
         CriticInput::Observation => 0,
         CriticInput::GroundTruth => CRITIC_STATE,
     };
-    let row = 4 * (2 * (config.observation_layout().len() + message) + ACTION + 2) as u64;
+    let teacher_action = match config.teacher.is_configured() {
+        true => ACTION,
+        false => 0,
+    };
+    let step = config.observation_layout().len() + message;
+    let row = 4 * (2 * step + ACTION + teacher_action + 2) as u64;
     let steps = match learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps * learning.copies_per_transition(),
         EncoderTraining::EndToEnd => config.replay.capacity,
     };
     let images = 2 * steps as u64 + learning.episodes_per_epoch * records;
-    let images = images.min(config.run.episodes.saturating_mul(records));
+    let images = match config.vae.start_from {
+        Some(_) => 0,
+        None => images.min(config.run.episodes.saturating_mul(records)),
+    };
     let snapshot = 4 * SnapshotLayout::of(config).values() as u64;
     rows * row + images * IMAGE_PIXELS as u64 + CHECKPOINT_SNAPSHOTS * snapshot
 }

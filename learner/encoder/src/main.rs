@@ -1,8 +1,7 @@
 //! `skein-encoder`: trains an encoder before any run, or measures one.
 
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use anyhow::{Context, Result};
 use clap::Parser;
@@ -14,7 +13,7 @@ use skein_protocol::config::Config;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_run::allocation::keep_freed_memory;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
-use skein_run::signals::{is_ignored, survive_file_size_limit};
+use skein_run::signals::{end_on_signal, survive_file_size_limit};
 use skein_run::{note, show};
 
 fn main() -> ExitCode {
@@ -38,7 +37,9 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
         show!("{}", Measurement::of(&encoder, &config, &settings)?);
         return Ok(ExitCode::SUCCESS);
     }
-    let stop = stop_on_signals().context("cannot listen to signals")?;
+    let stop = end_on_signal().context("cannot listen to signals")?;
+    // Signals end the process at once while the flag is set: then there is nothing to save.
+    stop.store(true, Ordering::Relaxed);
     let mut training = Training::begin(&config, &settings, arguments.files()?)?;
     stop.store(false, Ordering::Relaxed);
     let ending = training.train(&stop)?;
@@ -55,18 +56,4 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
             Ok(ExitCode::from(EXIT_INTERRUPTED))
         }
     }
-}
-
-/// Returns a flag that SIGTERM and SIGINT set, unless they were ignored when this process started.
-/// While it is set, as it is at first, they end the process at once: there is nothing to save.
-fn stop_on_signals() -> std::io::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(true));
-    for number in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {
-        if !is_ignored(number) {
-            let status = EXIT_INTERRUPTED.into();
-            signal_hook::flag::register_conditional_shutdown(number, status, stop.clone())?;
-            signal_hook::flag::register(number, stop.clone())?;
-        }
-    }
-    Ok(stop)
 }

@@ -1,16 +1,39 @@
-//! Signals that a program ignores: those ignored when it started, as under `nohup`, and SIGXFSZ.
+//! Signals that end a program, and those that it ignores: those ignored when it started, as under
+//! `nohup`, and SIGXFSZ.
 
 use std::fs;
+use std::io;
 use std::os::unix::process::CommandExt;
 use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use rustix::process::Signal;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::flag;
 
 /// Returns `true` if this process ignores the signal with this number. Ask before a handler is
 /// installed: what the shell, `nohup` or a service manager chose to ignore must stay ignored.
 pub fn is_ignored(number: i32) -> bool {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     is_in_mask(&status, number)
+}
+
+/// Returns a flag that SIGTERM and SIGINT set. One that comes while the flag is set ends the process
+/// at once. One that was ignored when this process started stays ignored.
+///
+/// # Errors
+/// If the system installs no handler.
+pub fn end_on_signal() -> io::Result<Arc<AtomicBool>> {
+    let end = Arc::new(AtomicBool::new(false));
+    for number in [SIGTERM, SIGINT] {
+        if !is_ignored(number) {
+            // In this order: only the second signal finds the flag set.
+            flag::register_conditional_default(number, end.clone())?;
+            flag::register(number, end.clone())?;
+        }
+    }
+    Ok(end)
 }
 
 /// Lets a write beyond the limit of file sizes (`ulimit -f`) fail with an error, which names its

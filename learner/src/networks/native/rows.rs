@@ -30,14 +30,15 @@ pub fn smaller([one, other]: [f32; ESTIMATES]) -> f32 {
     }
 }
 
-/// Returns tanh x and its derivative. With e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), its
-/// derivative 4 e / (1 + e)². Both stay exact where tanh saturates.
+/// Returns tanh x, its derivative, and e = exp(-2|x|): tanh|x| = (1 - e) / (1 + e), the derivative
+/// is 4 e / (1 + e)². Both stay exact where tanh saturates.
 #[inline(always)]
-pub fn squash(x: f32) -> [f32; 2] {
+pub fn squash(x: f32) -> [f32; 3] {
     let e = exp(-2.0 * x.abs());
     [
         ((1.0 - e) / (1.0 + e)).copysign(x),
         4.0 * e / ((1.0 + e) * (1.0 + e)),
+        e,
     ]
 }
 

@@ -89,8 +89,8 @@ impl Sample {
                     let log_std = log_std.clamp(LOG_STD.0, LOG_STD.1);
                     *deviation = exp(log_std) * noise;
                     let x = *mean + *deviation;
-                    [*action, *slope] = squash(x);
-                    let e = exp(-2.0 * x.abs());
+                    let e;
+                    [*action, *slope, e] = squash(x);
                     // log(1 - tanh²x) = 2 (ln 2 - x - softplus(-2x)) = 2 (ln 2 - |x| - ln(1 + e)).
                     let correction = 2.0 * (LN_2 - x.abs() - ln_1p(e));
                     *log_prob = -0.5 * noise * noise - log_std - HALF_LN_TAU - correction;
