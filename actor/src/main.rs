@@ -12,8 +12,8 @@ use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::{Courses, Simulators};
 use skein_rollout::environment_loop::EnvironmentLoop;
-use skein_run::allocation::return_large_blocks;
-use skein_run::failure::{EXIT_LEARNER_GONE, with_causes};
+use skein_run::allocation::{EndWithoutMemory, return_large_blocks};
+use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_OUT_OF_MEMORY, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::note;
 use skein_run::signals::{end_on_signal, survive_file_size_limit};
@@ -38,6 +38,12 @@ struct Arguments {
     #[arg(long, value_name = "ID")]
     id: Option<u32>,
 }
+
+#[global_allocator]
+static ALLOCATOR: EndWithoutMemory = EndWithoutMemory {
+    program: "skein-actor",
+    status: EXIT_OUT_OF_MEMORY,
+};
 
 fn main() -> ExitCode {
     survive_file_size_limit();

@@ -22,12 +22,15 @@ use skein_launch::resume::resume;
 use skein_launch::supervisor::{
     self, Deadlines, Ended, Programs, SupervisionPlan, SupervisorError,
 };
-use skein_prepare::room::{check_shared_memory_for_more, raise_file_limit, scarce_disk};
+use skein_prepare::room::{
+    check_library_space, check_shared_memory_for_more, raise_file_limit, scarce_disk,
+};
 use skein_prepare::{NewDirectory, Prepared, prepare};
 use skein_protocol::config::{Config, CoursesSection, EvaluationSection};
 use skein_protocol::summary::RunEnding;
 use skein_reports::{ideal_walls_passed, load_courses};
 use skein_run::ActorClaim;
+use skein_run::allocation::EndWithoutMemory;
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use skein_run::logging::environment_faults;
 use skein_run::signals::survive_file_size_limit;
@@ -47,6 +50,12 @@ const PATIENCE: Duration = Duration::from_secs(10);
 #[derive(Debug, thiserror::Error)]
 #[error("the run failed")]
 struct Unfinished;
+
+#[global_allocator]
+static ALLOCATOR: EndWithoutMemory = EndWithoutMemory {
+    program: "skein",
+    status: 1,
+};
 
 fn main() -> ExitCode {
     survive_file_size_limit();
@@ -292,6 +301,7 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
 
 /// Becomes the program that trains encoders: it needs libtorch, which this one does without.
 fn encoder(arguments: &EncoderArguments) -> anyhow::Result<ExitCode> {
+    check_library_space()?;
     let program = std::env::current_exe()
         .context("cannot find where this program lies")?
         .with_file_name("skein-encoder");

@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use skein_run::terminal::quoted;
 use skein_run::{LockError, PathError, RunDirectory, RunError, SupervisorLock};
 
-use skein_prepare::room::{check_file_size, check_folders, check_shared_memory};
+use skein_prepare::room::{
+    check_address_space, check_file_size, check_folders, check_shared_memory,
+};
 use skein_prepare::{PrepareError, Prepared, check};
 
 /// Time between two checks whether an earlier learner has ended.
@@ -135,6 +137,7 @@ pub fn resume(
     check(&run.config(), &config, actors)?;
     check_shared_memory(&config, actors).map_err(PrepareError::from)?;
     check_file_size(&config, actors).map_err(PrepareError::from)?;
+    check_address_space(&config, actors).map_err(PrepareError::from)?;
     check_folders().map_err(PrepareError::from)?;
     Ok((
         Prepared {

@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use clap::Parser;
 use skein_learner::training::{self, TrainingError};
-use skein_run::allocation::keep_freed_memory;
-use skein_run::failure::{EXIT_RESTART, with_causes};
+use skein_run::allocation::{EndWithoutMemory, keep_freed_memory};
+use skein_run::failure::{EXIT_OUT_OF_MEMORY, EXIT_RESTART, with_causes};
 use skein_run::logging::{LogFormat, log_to_file};
 use skein_run::note;
 use skein_run::signals::{is_ignored, survive_file_size_limit};
@@ -29,6 +29,12 @@ struct Arguments {
     #[arg(long)]
     run: PathBuf,
 }
+
+#[global_allocator]
+static ALLOCATOR: EndWithoutMemory = EndWithoutMemory {
+    program: "skein-learner",
+    status: EXIT_OUT_OF_MEMORY,
+};
 
 fn main() -> ExitCode {
     survive_file_size_limit();

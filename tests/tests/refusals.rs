@@ -196,6 +196,66 @@ fn too_little_shared_memory_is_refused() {
     assert!(!run.exists());
 }
 
+/// Runs `command` in a shell that limits the address space of each process.
+fn limited(kib: u64, command: &str) -> ProgramOutput {
+    let output = Command::new("bash")
+        .args(["-c", &format!("ulimit -v {kib}; exec {command}")])
+        // With it, the standard library waited forever for memory to print where memory ran out.
+        .env("RUST_BACKTRACE", "1")
+        .output()
+        .unwrap();
+    ProgramOutput {
+        code: output.status.code(),
+        stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
+        stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+    }
+}
+
+#[test]
+fn a_run_whose_learner_has_too_little_memory_is_refused() {
+    let attempt = Attempt::new("");
+    let (config, run) = (attempt.path().join("mine.toml"), attempt.path().join("run"));
+    let command = format!(
+        "{} run --config {} --run-dir {} --actors 1",
+        program("skein").display(),
+        config.display(),
+        run.display()
+    );
+    limited(500_000, &command).assert_refused(&["the learner needs", "488 MiB", "ulimit -v"]);
+    assert!(!run.exists());
+    let command = format!("{} encoder --help", program("skein").display());
+    limited(400_000, &command).assert_refused(&["libtorch", "390 MiB", "ulimit -v"]);
+}
+
+/// Whatever fails first for want of memory: nothing waits, and who gets as far as to say something
+/// names the limit.
+#[test]
+fn a_program_that_is_refused_memory_ends_at_once_and_names_the_limit() {
+    let snapshot = repository().join("configs/snapshots/generalist.safetensors");
+    let course = repository().join("configs/courses/training.toml");
+    let command = format!(
+        "timeout 60 {} --snapshot {} --course {} --episodes 1 --threads 1",
+        program("skein-evaluate").display(),
+        snapshot.display(),
+        course.display()
+    );
+    let mut refused = 0;
+    for kib in (10_000..=24_000).step_by(2_000) {
+        let output = limited(kib, &command);
+        assert_ne!(
+            output.code,
+            Some(124),
+            "it hangs with {kib} KiB: {output:?}"
+        );
+        if output.stderr.contains("out of memory") {
+            assert_eq!(output.code, Some(1), "{output:?}");
+            output.assert_refused(&["skein-evaluate: out of memory", "MiB", "ulimit -v"]);
+            refused += 1;
+        }
+    }
+    assert!(refused > 0, "no limit was between too much and too little");
+}
+
 #[test]
 fn an_impossible_resumption_is_refused() {
     let empty = tempfile::tempdir().unwrap();

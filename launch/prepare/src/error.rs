@@ -10,7 +10,7 @@ use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
 use skein_simulator::simulator::{OutOfReach, SimulatorError};
 
-use super::room::{FilesTooSmall, FoldersTooSmall, SharedMemoryTooSmall};
+use super::room::{FilesTooSmall, FoldersTooSmall, SharedMemoryTooSmall, TooLittleMemory};
 
 /// Reason why a run cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -145,6 +145,9 @@ pub enum PrepareError {
     /// The limit on the size of a file is too low.
     #[error(transparent)]
     FileSize(#[from] FilesTooSmall),
+    /// The limit on the address space of a process is too low.
+    #[error(transparent)]
+    Memory(#[from] TooLittleMemory),
     /// The run's directory is not empty.
     #[error(
         "{} is not empty: choose another --run-dir, \

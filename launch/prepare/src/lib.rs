@@ -49,6 +49,7 @@ pub fn prepare(
     room::check_shared_memory(&config, actors)?;
     room::check_folders()?;
     room::check_file_size(&config, actors)?;
+    room::check_address_space(&config, actors)?;
     let new = NewDirectory::make(run_directory)?;
     match fill(&new, config) {
         Ok(prepared) => Ok(Prepared {

@@ -9,6 +9,7 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use skein_protocol::config::{Config, CriticInput, EncoderTraining};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::{ACTION, CRITIC_STATE, IMAGE_PIXELS};
+use skein_run::allocation::{MemoryLimit, memory_limit};
 use skein_transport::shared_memory_needed;
 
 /// Folder of iceoryx2's segments.
@@ -27,6 +28,14 @@ const FILES_PER_ACTOR: u64 = 10;
 /// snapshots of the same configuration. Measured: 23, as `tensors.safetensors` of a checkpoint of
 /// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
 const CHECKPOINT_SNAPSHOTS: u64 = 24;
+
+/// Address space of a learner without what it learns with, in bytes: libraries, stacks, and what the
+/// allocator reserves. Measured with `configs/smoke.toml` and two threads, where all adds up to 915
+/// MiB: the transport of a learner with 781 MiB fails, one with 830 MiB begins, one without a limit
+/// reaches 1120 MiB in the end.
+const ADDRESS_SPACE: u64 = 600 << 20;
+/// Address space of each of its threads for tensors, in bytes: a stack and the allocator's reserve.
+const ADDRESS_SPACE_PER_THREAD: u64 = 72 << 20;
 
 /// Shared memory has less free space than a run needs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -200,6 +209,67 @@ fn check_size_within(
     }
 }
 
+/// The limit on the address space of a process is too low for one with libtorch.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{who} needs {} MiB of address space, but {} {}",
+    needed.div_ceil(MIB),
+    MemoryLimit(*limit),
+    needed.div_ceil(1 << 10)
+)]
+pub struct TooLittleMemory {
+    /// The process, for readers.
+    who: &'static str,
+    /// Bytes.
+    needed: u64,
+    /// Bytes.
+    limit: u64,
+}
+
+/// Checks that the learner of a run with `config` and `actors` actors, a child of this process, may
+/// have as much address space as it needs at least.
+///
+/// # Errors
+/// [`TooLittleMemory`] names the required and the allowed size, and the remedy.
+pub fn check_address_space(config: &Config, actors: usize) -> Result<(), TooLittleMemory> {
+    check_address_space_within(config, actors, memory_limit())
+}
+
+/// `limit`: bytes; `None` is no limit.
+fn check_address_space_within(
+    config: &Config,
+    actors: usize,
+    limit: Option<u64>,
+) -> Result<(), TooLittleMemory> {
+    let threads = config.run.learner_threads as u64 * ADDRESS_SPACE_PER_THREAD;
+    let needed =
+        ADDRESS_SPACE + threads + shared_memory_needed(config, actors) + checkpoint_bytes(config);
+    match limit {
+        Some(limit) if limit < needed => Err(TooLittleMemory {
+            who: "the learner",
+            needed,
+            limit,
+        }),
+        _ => Ok(()),
+    }
+}
+
+/// Checks that a program with libtorch, a child of this process, can load its libraries: without
+/// room for them it dies before it can say why.
+///
+/// # Errors
+/// [`TooLittleMemory`] names the required and the allowed size, and the remedy.
+pub fn check_library_space() -> Result<(), TooLittleMemory> {
+    match memory_limit() {
+        Some(limit) if limit < ADDRESS_SPACE => Err(TooLittleMemory {
+            who: "a program with libtorch",
+            needed: ADDRESS_SPACE,
+            limit,
+        }),
+        _ => Ok(()),
+    }
+}
+
 /// Returns the free bytes of shared memory; `None` if unknown.
 pub fn free_shared_memory() -> Option<u64> {
     space(Path::new(SHARED_MEMORY)).map(|space| space.free)
@@ -314,6 +384,23 @@ mod tests {
         for part in ["100 KiB", "ulimit -f", "shared memory"] {
             assert!(error.to_string().contains(part), "{error}");
         }
+    }
+
+    #[test]
+    fn an_address_space_too_small_for_a_learner_is_refused_with_figures_and_remedy() {
+        let config = Config::default();
+        let checked = |limit| check_address_space_within(&config, 2, limit);
+        assert_eq!(checked(None), Ok(()));
+        let error = checked(Some(500 << 20)).unwrap_err();
+        assert_eq!(checked(Some(error.needed)), Ok(()));
+        assert!(checked(Some(error.needed - 1)).is_err());
+        let needed = format!("{} MiB", error.needed.div_ceil(MIB));
+        for part in ["500 MiB", "ulimit -v", &needed] {
+            assert!(error.to_string().contains(part), "{error}");
+        }
+        let mut larger = config.clone();
+        larger.run.learner_threads += 4;
+        assert!(check_address_space_within(&larger, 2, Some(error.needed)).is_err());
     }
 
     #[test]

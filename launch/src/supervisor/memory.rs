@@ -2,7 +2,9 @@
 //!
 //! A process that touches a page of shared memory for which no memory is left dies of SIGBUS. When
 //! a control group or the machine runs out of memory, the kernel kills a process with SIGKILL. Only
-//! the kernel's counter of such kills distinguishes this from a user's kill.
+//! the kernel's counter of such kills distinguishes this from a user's kill. A process that is
+//! refused memory says so by its exit status. Under a limit of the shell (`ulimit -v`), libraries
+//! that are refused memory may fail in any other way.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -10,6 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use rustix::process::Signal;
 use skein_prepare::room::free_shared_memory;
+use skein_run::allocation::{MemoryLimit, memory_limit};
 use skein_run::control_groups::{MemoryGroup, counter_in, memory_groups};
 
 use super::process::Exit;
@@ -22,7 +25,7 @@ const FULL: u64 = 8 << 20;
 pub(super) enum MemoryShortage {
     /// Shared memory was full. Other processes fill and empty it: a later start may find room.
     Shared(String),
-    /// The kernel killed the process because memory ran out. A later incarnation needs as much.
+    /// The process was killed or ended because memory ran out. A later incarnation needs as much.
     Own(String),
 }
 
@@ -70,7 +73,8 @@ impl MemoryWatch {
     pub(super) fn shortage(&self, exit: &Exit) -> Option<MemoryShortage> {
         match *exit {
             Exit::Signal(signal) if signal == Signal::KILL.as_raw() => self.kill_by_kernel(),
-            _ => shared_shortage(exit, free_shared_memory()),
+            _ => shared_shortage(exit, free_shared_memory())
+                .or_else(|| refusal(exit, memory_limit())),
         }
     }
 
@@ -110,6 +114,22 @@ fn shared_shortage(exit: &Exit, free: Option<u64>) -> Option<MemoryShortage> {
     })
 }
 
+/// Returns the shortage of a process that ended with `exit` because it was refused memory, or may
+/// have failed for that reason where each process is limited to `limit` bytes.
+fn refusal(exit: &Exit, limit: Option<u64>) -> Option<MemoryShortage> {
+    let text = match limit.map(MemoryLimit) {
+        Some(limit) if exit.ran_out_of_memory() => format!(": {limit}"),
+        Some(limit) if exit.may_recover() && !exit.was_killed() => {
+            format!(", perhaps for want of memory: {limit}")
+        }
+        None if exit.ran_out_of_memory() => ": end other programs, start fewer actors with \
+            --actors, or in a new run lower replay.capacity"
+            .to_owned(),
+        _ => return None,
+    };
+    Some(MemoryShortage::Own(text))
+}
+
 #[cfg(test)]
 mod tests {
     use std::fs;
@@ -128,6 +148,38 @@ mod tests {
         assert_eq!(shared_shortage(&Exit::Signal(7), Some(FULL)), None);
         assert_eq!(shared_shortage(&Exit::Signal(11), Some(0)), None);
         assert_eq!(shared_shortage(&Exit::Signal(7), None), None);
+    }
+
+    #[test]
+    fn a_refusal_names_the_shells_limit_and_its_remedy() {
+        let text = |exit: &Exit, limit| {
+            let shortage = refusal(exit, limit)?;
+            assert!(matches!(shortage, MemoryShortage::Own(_)));
+            Some(format!("{exit}{}", shortage.text()))
+        };
+        let (refused, panicked) = (Exit::Status(5), Exit::Status(101));
+        let limit = Some(488 << 20);
+        for (exit, limit, parts) in [
+            (&refused, limit, ["out of memory: ", "488 MiB", "ulimit -v"]),
+            (
+                &refused,
+                None,
+                ["out of memory: ", "--actors", "replay.capacity"],
+            ),
+            (&panicked, limit, ["perhaps", "488 MiB", "ulimit -v"]),
+            (&Exit::Signal(6), limit, ["perhaps", "488 MiB", "ulimit -v"]),
+        ] {
+            let text = text(exit, limit).unwrap();
+            for part in parts {
+                assert!(text.contains(part), "`{part}` is missing in {text}");
+            }
+        }
+        assert_eq!(text(&panicked, None), None);
+        // What a user or the program itself did has another reason.
+        for exit in [Exit::Signal(15), Exit::Status(1), Exit::Status(3)] {
+            assert_eq!(text(&exit, limit), None);
+        }
+        assert!(refused.may_recover(), "it is started again, with pauses");
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use rustix::process::{Pid, Signal, kill_process};
-use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_RESTART};
+use skein_run::failure::{EXIT_LEARNER_GONE, EXIT_OUT_OF_MEMORY, EXIT_RESTART};
 use tokio::process::{Child, Command};
 use tokio::sync::watch;
 
@@ -18,6 +18,7 @@ use skein_run::signals::heed;
 
 /// Exit status of a Rust program that panicked.
 const PANICKED: i32 = 101;
+const OUT_OF_MEMORY: i32 = EXIT_OUT_OF_MEMORY as i32;
 
 /// Instruction to a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -69,11 +70,18 @@ impl Exit {
             .any(|signal| *self == Self::Signal(signal.as_raw()))
     }
 
-    /// Returns `true` if a restart may help: it was killed, it panicked, or its transport failed.
-    /// An error that the program reported itself would only repeat.
+    /// Returns `true` if it ended because it was refused memory.
+    pub(super) fn ran_out_of_memory(&self) -> bool {
+        *self == Self::Status(OUT_OF_MEMORY)
+    }
+
+    /// Returns `true` if a restart may help: it was killed, it panicked, its transport failed, or
+    /// memory ran out. An error that the program reported itself would only repeat.
     pub(super) fn may_recover(&self) -> bool {
         match *self {
-            Self::Status(status) => status == PANICKED || status == i32::from(EXIT_RESTART),
+            Self::Status(status) => {
+                [PANICKED, EXIT_RESTART.into(), OUT_OF_MEMORY].contains(&status)
+            }
             Self::Signal(_) | Self::Unknown(_) => true,
         }
     }
@@ -83,6 +91,7 @@ impl fmt::Display for Exit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Status(PANICKED) => f.write_str("panicked"),
+            Self::Status(OUT_OF_MEMORY) => f.write_str("ran out of memory"),
             Self::Status(status) => write!(f, "exited with status {status}"),
             Self::Signal(signal) => write!(f, "was killed by signal {signal}"),
             Self::Unknown(how) => f.write_str(how),

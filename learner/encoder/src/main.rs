@@ -11,10 +11,16 @@ use skein_encoder::training::{Ending, Training};
 use skein_encoder::views::simulator_settings;
 use skein_protocol::config::Config;
 use skein_protocol::encoder_file::TrainedEncoder;
-use skein_run::allocation::keep_freed_memory;
+use skein_run::allocation::{EndWithoutMemory, keep_freed_memory};
 use skein_run::failure::{EXIT_INTERRUPTED, with_causes};
 use skein_run::signals::{end_on_signal, survive_file_size_limit};
 use skein_run::{note, show};
+
+#[global_allocator]
+static ALLOCATOR: EndWithoutMemory = EndWithoutMemory {
+    program: "skein encoder",
+    status: 1,
+};
 
 fn main() -> ExitCode {
     survive_file_size_limit();

@@ -15,6 +15,9 @@ pub const EXIT_LEARNER_GONE: u8 = 3;
 /// newest checkpoint.
 pub const EXIT_RESTART: u8 = 4;
 
+/// Exit status of a learner or an actor that ran out of memory.
+pub const EXIT_OUT_OF_MEMORY: u8 = 5;
+
 /// Exit status of a program that its user interrupted, as shells report it: 128 + SIGINT.
 pub const EXIT_INTERRUPTED: u8 = 130;
 
