@@ -123,12 +123,15 @@ impl Courses {
         self
     }
 
-    /// Checks that an episode can reach the end of each evaluation course.
+    /// Checks that each evaluation course can be simulated, and that an episode can reach its end.
     ///
     /// # Errors
-    /// [`CoursesError::OutOfReach`] names the entry, the distances and their keys.
-    pub fn check_reach(&self) -> Result<(), CoursesError> {
+    /// [`CoursesError`] names the setting at fault, or the entry, the distances and their keys.
+    pub fn check(&self) -> Result<(), CoursesError> {
         self.evaluation.iter().try_for_each(|evaluated| {
+            // Of an entry's courses, one is enough: what they differ in was checked with them.
+            let course = evaluated.entry.courses.of_episode(0)?;
+            Simulator::new(course, &evaluated.settings)?;
             let reached = evaluated.entry.courses.check_reach(&evaluated.settings);
             reached.map_err(|source| CoursesError::OutOfReach {
                 entry: evaluated.entry.name.clone(),
@@ -280,6 +283,12 @@ pub enum CoursesError {
     /// The configuration's simulator section is invalid.
     #[error("[simulator] {0}")]
     Settings(String),
+    /// A setting of drone, camera, reward or disturbances is out of bounds.
+    #[error(transparent)]
+    Simulator(#[from] SimulatorError),
+    /// A course cannot be generated.
+    #[error(transparent)]
+    Ranges(#[from] RangesError),
     /// No episode can finish a course.
     #[error("\"{entry}\": {source}")]
     OutOfReach {

@@ -18,7 +18,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use serde::Serialize;
 use skein_kernels::Isa;
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, failing_override};
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::files::destination;
 use skein_protocol::snapshot::Snapshot;
@@ -119,15 +119,21 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Some(_) => Flown::Suite,
         None => Flown::Courses,
     };
-    let config = with_overrides(&trained, &path, &arguments.overrides, flown)?;
-    let courses = courses(arguments, &config, &path).and_then(|courses| {
-        courses.check_reach()?;
-        Ok(courses)
-    });
-    let courses = match arguments.overrides.join(" --set ") {
-        none if none.is_empty() => courses?,
-        overrides => courses.with_context(|| format!("with --set {overrides}"))?,
+    let planned = |overrides: &[String]| {
+        let config = with_overrides(&trained, &path, overrides, flown)?;
+        let courses = courses(arguments, &config, &path)?;
+        courses.check()?;
+        anyhow::Ok((config, courses))
     };
+    let (config, courses) = planned(&arguments.overrides).map_err(|error| {
+        let message = |overrides: &[String]| Some(planned(overrides).err()?.to_string());
+        match failing_override(&arguments.overrides, message) {
+            Some(text) if !error.to_string().contains("--set") => {
+                error.context(format!("with --set {text}"))
+            }
+            _ => error,
+        }
+    })?;
     if arguments.record.is_some() {
         let episodes = courses.evaluation().map(|entry| entry.episodes).sum();
         check_recording(episodes, courses.most_records(), free_memory())?;

@@ -429,6 +429,64 @@ fn settings_of_the_simulator_can_be_changed_and_others_are_refused() {
 }
 
 #[test]
+fn of_several_settings_the_one_at_fault_is_named_whatever_is_flown() {
+    let folder = run_folder();
+    let at = folder.path();
+    let suite = "name = \"s\"\nepisodes = 1\n[[entry]]\nname = \"one\"\ncourse = \
+                 \"courses/training.toml\"\n[[entry]]\nname = \"new\"\n[entry.generated]\n";
+    std::fs::write(at.join("suite.toml"), suite).unwrap();
+    std::fs::write(at.join("broken.toml"), "name = 1").unwrap();
+    let sound = [
+        "--set",
+        "run.seed=3",
+        "--set",
+        "simulator.vehicle.preset=point",
+    ];
+    let flown = [
+        &["--suite", "suite.toml"][..],
+        &["--course", "courses/training.toml"],
+        &[],
+    ];
+    for subject in flown {
+        for (set, part) in [
+            (
+                "simulator.vehicle.forward_speed_mps=-1",
+                "forward_speed_mps = -1",
+            ),
+            ("simulator.vehicle.preset=rocket", "rocket"),
+            ("simulator.generator.clearance_m=[3,1]", "no effect"),
+            ("simulator.camera.range_m=-2", "range_m = -2"),
+            ("simulator.camera.range_m=[1]", "range_m"),
+            ("simulator.reward.collision=nan", "collision"),
+            ("simulator.max_steps=0", "max_steps = 0"),
+            ("simulator.max_steps=20", "from the start"),
+            ("vae.latent=9", "vae.latent = 9"),
+        ] {
+            let last = [
+                "--set",
+                set,
+                "--set",
+                "simulator.vehicle.control_period_secs=0.4",
+            ];
+            let all = [&["--run", "."], subject, &sound, &last].concat();
+            let error = error_of(at, &all);
+            assert!(
+                error.contains(&format!("--set {set}")) && error.contains(part),
+                "{subject:?}: {error}"
+            );
+            assert!(!error.contains("--set run.seed"), "{error}");
+            assert!(!error.contains("networks are computed"), "{error}");
+        }
+        // A fault of the file is not blamed on a setting.
+        let broken = error_of(
+            at,
+            &[&["--run", "."], &sound[..], &["--course", "broken.toml"]].concat(),
+        );
+        assert!(!broken.contains("--set"), "{broken}");
+    }
+}
+
+#[test]
 fn a_failed_evaluation_creates_and_changes_no_file() {
     let folder = run_folder();
     let at = folder.path();
