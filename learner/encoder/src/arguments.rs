@@ -13,7 +13,7 @@ use clap::Parser;
 #[derive(Debug, Parser)]
 #[command(name = "skein encoder", bin_name = "skein encoder", version, after_help = NOTES)]
 pub struct Arguments {
-    /// Configuration: [encoder], [vae], [simulator] and run.seed count. launch/encoder.sh sets
+    /// Configuration. Of its keys, those that --set takes count. launch/encoder.sh sets
     /// configs/encoder.toml by default.
     #[arg(long, value_name = "FILE", overrides_with = "config")]
     pub config: PathBuf,
@@ -24,6 +24,10 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", conflicts_with = "output")]
     pub measure: Option<PathBuf>,
     /// Change one setting of the config, for example --set encoder.steps=2000; may be repeated.
+    ///
+    /// These have an effect: [encoder]; vae.latent, batch_size, learning_rate and kl_weight; camera,
+    /// generator, the vehicle's preset and the disturbances' share and depth of [simulator];
+    /// run.seed and run.learner_threads. With --measure, those of [simulator] and [run].
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     pub overrides: Vec<String>,
 }
@@ -49,7 +53,52 @@ pub struct EncoderFiles {
     pub reconstructions: PathBuf,
 }
 
+/// Sections and keys that count for a training alone.
+const TRAINED_WITH: [&str; 5] = [
+    "encoder",
+    "vae.latent",
+    "vae.batch_size",
+    "vae.learning_rate",
+    "vae.kl_weight",
+];
+/// Sections and keys that count for the views, and so for a measurement too.
+const SEEN_WITH: [&str; 7] = [
+    "simulator.vehicle.preset",
+    "simulator.camera",
+    "simulator.generator",
+    "simulator.disturbances.share",
+    "simulator.disturbances.depth",
+    "run.seed",
+    "run.learner_threads",
+];
+
 impl Arguments {
+    /// Refuses an override of a key that the training, or the measurement, does not use.
+    ///
+    /// # Errors
+    /// Names the override and the keys that count.
+    pub fn check_overrides(&self) -> Result<()> {
+        let (what, trained_with) = match self.measure {
+            Some(_) => ("a measurement", &[][..]),
+            None => ("an encoder's training", &TRAINED_WITH[..]),
+        };
+        let used = [trained_with, &SEEN_WITH].concat();
+        let is_in = |key: &str, section: &str| {
+            key.strip_prefix(section)
+                .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+        };
+        for text in &self.overrides {
+            let key = text.split_once('=').map_or(text.as_str(), |(key, _)| key);
+            let key = key.trim();
+            anyhow::ensure!(
+                used.iter().any(|used| is_in(key, used) || is_in(used, key)),
+                "--set {text}: {key} has no effect on {what}; only {} have",
+                used.join(", ")
+            );
+        }
+        Ok(())
+    }
+
     /// Returns the files of the training.
     ///
     /// # Errors
@@ -72,5 +121,85 @@ impl Arguments {
             curve_picture: beside("_loss.png"),
             reconstructions: beside("_reconstructions.png"),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use skein_protocol::config::Config;
+
+    use super::*;
+
+    fn checked(command: &[&str], overrides: &[&str]) -> Result<(), String> {
+        let mut all = [&["skein encoder", "--config", "encoder.toml"], command].concat();
+        overrides
+            .iter()
+            .for_each(|text| all.extend(["--set", text]));
+        let arguments = Arguments::parse_from(all);
+        arguments
+            .check_overrides()
+            .map_err(|error| error.to_string())
+    }
+
+    const TRAINING: [&str; 2] = ["--output", "e.safetensors"];
+    const MEASUREMENT: [&str; 2] = ["--measure", "e.safetensors"];
+
+    #[test]
+    fn settings_without_effect_are_refused_by_name() {
+        let sound = "encoder.steps=9";
+        for key in [
+            "vae.train_steps",
+            "vae.start_from",
+            "vae.recode_steps",
+            "vae.updates_per_step",
+            "vae.decoder",
+            "run.episodes",
+            "run.device",
+            "sac.discount",
+            "simulator.max_steps",
+            "simulator.reward.collision",
+            "simulator.disturbances.gust.force_rms_n",
+            "simulator.vehicle.forward_speed_mps",
+            "encoders.steps",
+        ] {
+            let text = format!("{key}=1");
+            let error = checked(&TRAINING, &[sound, &text]).unwrap_err();
+            let expected = format!("--set {text}: {key} has no effect on an encoder's training");
+            assert!(error.starts_with(&expected), "{error}");
+            assert!(error.contains("vae.latent, vae.batch_size"), "{error}");
+        }
+        let error = checked(&MEASUREMENT, &["vae.latent=8"]).unwrap_err();
+        assert!(error.contains("no effect on a measurement"), "{error}");
+    }
+
+    #[test]
+    fn every_setting_of_views_networks_and_schedule_is_taken() {
+        for key in TRAINED_WITH.into_iter().chain(SEEN_WITH) {
+            assert_eq!(checked(&TRAINING, &[&format!("{key}=1")]), Ok(()));
+        }
+        for text in [
+            "simulator.generator.clearance_m=[1,2]",
+            "simulator.disturbances={share=0.5}",
+        ] {
+            assert_eq!(checked(&TRAINING, &[text]), Ok(()));
+            assert_eq!(checked(&MEASUREMENT, &[text]), Ok(()));
+        }
+    }
+
+    /// The vae keys listed here and those refused above are all there are.
+    #[test]
+    fn every_key_of_the_vae_is_either_used_or_refused() {
+        let mut config = Config::default();
+        config.vae.start_from = Some(PathBuf::from("e.safetensors"));
+        let text = config.portable();
+        let (_, vae) = text.split_once("[vae]\n").unwrap();
+        let lines = vae.lines().take_while(|line| !line.starts_with('['));
+        let keys: Vec<_> = lines.filter_map(|line| line.split_once(" = ")).collect();
+        assert!(keys.len() >= 9, "{keys:?}");
+        let is_used = |key: &str| checked(&TRAINING, &[&format!("vae.{key}=1")]).is_ok();
+        let mut used: Vec<_> = keys.iter().map(|(key, _)| *key).collect();
+        used.retain(|key| is_used(key));
+        used.sort();
+        assert_eq!(used, ["batch_size", "kl_weight", "latent", "learning_rate"]);
     }
 }

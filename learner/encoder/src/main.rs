@@ -36,6 +36,7 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<ExitCode> {
     let config = Config::load(&arguments.config, &arguments.overrides)?;
+    arguments.check_overrides()?;
     let settings =
         simulator_settings(&config).with_context(|| arguments.config.display().to_string())?;
     if let Some(file) = &arguments.measure {
