@@ -33,6 +33,8 @@ needs no network. The other scripts call this one.
 
 Environment:
   LIBTORCH   your own libtorch $TORCH_VERSION (a CUDA build, say): it is used, and nothing is downloaded
+
+Exit status: 0 libtorch is there, 1 failed, 2 wrong arguments.
 END
 }
 
@@ -167,7 +169,10 @@ main() {
     case ${1-} in
         '') ;;
         -h | --help) usage; exit 0 ;;
-        *) fail "unknown argument \"$1\": see launch/setup.sh --help" ;;
+        *)
+            echo "setup.sh: unknown argument \"$1\": see launch/setup.sh --help" >&2
+            exit 2
+            ;;
     esac
     check_tools
     if [[ -n ${LIBTORCH-} ]]; then

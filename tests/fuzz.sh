@@ -19,7 +19,7 @@ Options:
   --jobs N        targets driven at one time [default: one a core]
   -h, --help      this text
 
-Exit status: 0 nothing was found, 1 something was, or the targets could not be driven; 2 wrong arguments.
+Exit status: 0 nothing was found, 1 something was, or the targets could not be driven, 2 wrong arguments.
 END
 
 fail() {

@@ -35,6 +35,7 @@ pub(crate) enum Command {
     Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
+    #[command(after_long_help = REPORT_NOTES)]
     Report(ReportArguments),
 }
 
@@ -193,6 +194,9 @@ suite under way is flown again the next time. A second Ctrl-C stops at once.
 
 Exit status: 0 every run is complete, 1 a run failed or something was refused, 2 wrong arguments, \
 130 interrupted.";
+
+const REPORT_NOTES: &str = "\
+Exit status: 0 drawn, 1 a plot could not be drawn or the run not be read, 2 wrong arguments.";
 
 /// Draws the plots of a run again, from the files it left, and prints their paths.
 #[derive(Args)]

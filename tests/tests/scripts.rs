@@ -50,6 +50,85 @@ fn every_script_finds_its_repository_through_a_link_and_with_cdpath_set() {
     }
 }
 
+/// Scripts that users call.
+fn scripts() -> Vec<String> {
+    let of_folder = |folder: &'static str| {
+        let entries = fs::read_dir(repository().join(folder)).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        names
+            .filter(|name| name.ends_with(".sh") && name != "common.sh")
+            .map(move |name| format!("{folder}/{name}"))
+    };
+    ["launch", "tests"]
+        .into_iter()
+        .flat_map(of_folder)
+        .collect()
+}
+
+#[test]
+fn every_help_says_in_the_same_words_that_wrong_arguments_end_with_status_2() {
+    let commands = [
+        "run",
+        "attach",
+        "evaluate",
+        "experiment",
+        "report",
+        "encoder",
+    ];
+    let helps = scripts()
+        .into_iter()
+        .map(|script| {
+            let shown = bash(&format!("{script} --help"));
+            (script, shown)
+        })
+        .chain(commands.map(|command| {
+            let shown = run_program("skein", &[command, "--help"]).stdout;
+            (format!("skein {command}"), shown)
+        }));
+    let mut seen = 0;
+    for (whose, shown) in helps {
+        // Terminals of any width: the text may be wrapped.
+        let shown = shown.split_whitespace().collect::<Vec<_>>().join(" ");
+        let (_, status) = shown
+            .rsplit_once("Exit status: 0 ")
+            .unwrap_or_else(|| panic!("{whose} does not say what its exit status means"));
+        assert!(status.contains(", 2 wrong arguments"), "{whose}: {status}");
+        seen += 1;
+    }
+    assert!(seen >= 15, "{seen} commands and scripts");
+}
+
+#[test]
+fn wrong_arguments_end_with_status_2_and_a_line_on_the_remedy() {
+    for script in [
+        "launch/setup.sh",
+        "launch/test.sh",
+        "tests/bench.sh",
+        "tests/fuzz.sh",
+    ] {
+        let shown = bash(&format!("{script} --nonsense; echo status $?"));
+        let help = format!("see {script} --help");
+        for part in ["--nonsense", &help, "status 2"] {
+            assert!(shown.contains(part), "`{part}` is missing in {shown}");
+        }
+    }
+    for command in [
+        "run",
+        "attach",
+        "evaluate",
+        "experiment",
+        "report",
+        "encoder",
+    ] {
+        let output = run_program("skein", &[command, "--nonsense"]);
+        assert_eq!(output.code, Some(2), "{command}: {output:?}");
+        assert!(
+            output.stderr.contains("--nonsense"),
+            "{command}: {output:?}"
+        );
+    }
+}
+
 #[test]
 fn a_build_continues_when_its_output_is_lost() {
     let script = "source launch/common.sh

@@ -14,6 +14,7 @@ use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{Stage, ThreadRole};
 use skein_protocol::summary::RunEnding;
+use skein_run::RunDirectory;
 use skein_tests::{EndedRun, RunRecipe};
 
 #[test]
@@ -30,6 +31,53 @@ fn a_completed_run_leaves_all_documented_files() {
     the_plots_show_something(&run);
     every_process_has_its_log(&run);
     the_conclusion_shows_the_tables_and_the_paths(&run);
+}
+
+/// Puts a file where the folder of the plots is.
+fn block_plots(run: &RunDirectory) {
+    let _ = fs::remove_dir_all(run.plots());
+    fs::write(run.plots(), "").unwrap();
+}
+
+#[test]
+fn a_plot_that_cannot_be_drawn_changes_no_success() {
+    let mut running = RunRecipe::small().start();
+    running.until_episodes(1);
+    block_plots(running.directory());
+    // Its exit status is 0.
+    let run = running.finish();
+    let stderr = &run.output.stderr;
+    assert!(stderr.contains("a plot could not be drawn"), "{stderr}");
+    assert_eq!(run.summary().ending, RunEnding::Completed);
+    assert!(!run.output.stdout.is_empty());
+}
+
+#[test]
+fn a_plot_that_cannot_be_drawn_hides_no_failure_of_the_run() {
+    let mut running = RunRecipe::small().start();
+    running.until_episodes(21);
+    running.cut_off();
+    let checkpoints = fs::read_dir(running.directory().checkpoints()).unwrap();
+    for checkpoint in checkpoints {
+        for file in fs::read_dir(checkpoint.unwrap().path()).unwrap() {
+            fs::write(file.unwrap().path(), "damaged").unwrap();
+        }
+    }
+    // Garbage instead of a table fails to be drawn, whatever the folder of the plots is.
+    fs::write(running.directory().episodes_csv(), "\u{0}").unwrap();
+    running.resume(1);
+    let ended = running.wait();
+    let stderr = &ended.output.stderr;
+    assert_eq!(ended.output.code, Some(1), "{stderr}");
+    let place = |text: &str| {
+        let place = stderr.find(text);
+        place.unwrap_or_else(|| panic!("`{text}` is missing in {stderr}"))
+    };
+    let (failure, plot) = (place("checkpoint"), place("a plot could not be drawn"));
+    assert!(
+        failure < plot,
+        "the run's own failure comes first:\n{stderr}"
+    );
 }
 
 fn the_configuration_is_resolved(run: &EndedRun) {

@@ -407,6 +407,31 @@ mod tests {
         assert_eq!((one.value, one.interval), (1.5, None));
     }
 
+    /// Expected: the same percentiles over all 5^5 equally likely resamples, each drawn for both
+    /// arms, reckoned by other means (Python; middle half of each value counted four times). Where
+    /// each arm is drawn for itself, the intervals are [-0.124, 0.605] and [-0.064, 0.518].
+    #[test]
+    fn the_interval_of_a_difference_is_the_exact_one_over_all_resamples() {
+        let five = Bootstrap::new(5, RESAMPLES);
+        let values = [0.91, 0.42, 0.88, 0.99, 0.63];
+        let reference = [0.50, 0.61, 0.35, 0.97, 0.20];
+        for (difference, [value, low, high]) in [
+            (five.difference(&values, &reference), [0.326, -0.052, 0.5]),
+            (
+                five.difference_of_means(&values, &reference),
+                [0.24, -0.024, 0.466],
+            ),
+        ] {
+            let difference = difference.unwrap();
+            assert!((difference.value - value).abs() < 1e-9, "{difference:?}");
+            let interval = difference.interval.unwrap();
+            // A tenth of a percentile of 10,000 resamples.
+            for (found, exact) in [(interval.0, low), (interval.1, high)] {
+                assert!((found - exact).abs() < 0.02, "{difference:?}");
+            }
+        }
+    }
+
     #[test]
     fn one_value_has_no_interval_and_no_values_have_no_mean() {
         let one = Bootstrap::new(1, RESAMPLES).interquartile_mean(&[2.5]);

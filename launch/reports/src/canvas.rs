@@ -138,6 +138,17 @@ impl Canvas {
         Ok(())
     }
 
+    /// Returns the colour at a drawn pixel.
+    #[cfg(test)]
+    pub(super) fn colour_at(&self, (x, y): (i32, i32)) -> RGBColor {
+        let start = ((y as u32 * px(self.width) + x as u32) * 3) as usize;
+        RGBColor(
+            self.pixels[start],
+            self.pixels[start + 1],
+            self.pixels[start + 2],
+        )
+    }
+
     /// Returns the picture at its final size, each pixel the mean of the drawn ones.
     fn averaged(&self) -> Vec<u8> {
         let stride = px(self.width) as usize;

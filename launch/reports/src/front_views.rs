@@ -218,8 +218,13 @@ fn crossing(episode: &Trajectory, wall: &Wall) -> Option<[f32; 2]> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::canvas::Canvas;
 
     fn course(walls: usize) -> Course {
+        course_of(walls, "shape = \"circle\"\ndiameter_m = 2.2")
+    }
+
+    fn course_of(walls: usize, shape: &str) -> Course {
         let xs: Vec<_> = (1..=walls).map(|wall| format!("{}.0", 6 * wall)).collect();
         let order: Vec<_> = (1..=walls).map(|wall| wall.to_string()).collect();
         let mut text = format!(
@@ -232,8 +237,7 @@ mod tests {
         );
         for wall in 1..=walls {
             text.push_str(&format!(
-                "[[wall]]\nlabel = {wall}\nshape = \"circle\"\ncentre_m = [0.0, 3.5]\ndiameter_m = \
-                 2.2\n"
+                "[[wall]]\nlabel = {wall}\ncentre_m = [0.0, 3.5]\n{shape}\n"
             ));
         }
         Course::parse(&text, "c.toml").unwrap()
@@ -262,6 +266,45 @@ mod tests {
         assert_eq!(view.end_at_wall(&through), None);
         // The drone flies with y to its left: left in the view as well.
         assert!(view.at([1.0, 3.0]).0 < view.at([-1.0, 3.0]).0);
+    }
+
+    /// The corners of its bounding box belong to the wall; in a view of the box they were open.
+    #[test]
+    fn an_opening_is_drawn_by_its_shape() {
+        let (triangle, l) = (
+            "shape = \"triangle\"\nwidth_m = 3.6\nheight_m = 3.2",
+            "shape = \"l\"\nwidth_m = 3.0\nheight_m = 3.0\narm_m = 1.8",
+        );
+        let circle = "shape = \"circle\"\ndiameter_m = 2.2";
+        for (shape, closed_corners) in [(circle, 4), (triangle, 4), (l, 1)] {
+            let course = course_of(1, shape);
+            let wall = &course.walls()[0];
+            let view = FrontView {
+                course: &course,
+                wall,
+                scale: 40.0,
+                left: 20.0,
+                top: 40.0,
+            };
+            let mut canvas = Canvas::new(300, 300);
+            canvas.draw(|area| view.draw(area, 1, &[])).unwrap();
+            let colour = |at| canvas.colour_at(view.at(at));
+            let closed = colour([2.7, 6.7]);
+            assert_ne!(closed, CORRIDOR);
+            assert_eq!(colour(wall.safe_point()), CORRIDOR, "{shape}");
+            let outline = wall.outline();
+            let ends = [0, 1].map(|axis| {
+                let along = outline.iter().map(|point| point[axis]);
+                let (low, high) = along.fold((f32::MAX, f32::MIN), |(low, high), metres| {
+                    (low.min(metres), high.max(metres))
+                });
+                [low + 0.1, high - 0.1]
+            });
+            let corners = ends[0].map(|y_m| ends[1].map(|z_m| [y_m, z_m]));
+            let is_closed = |corner: &&[f32; 2]| colour(**corner) == closed;
+            let count = corners.iter().flatten().filter(is_closed).count();
+            assert_eq!(count, closed_corners, "{shape}");
+        }
     }
 
     #[test]

@@ -538,6 +538,40 @@ mod tests {
         );
     }
 
+    /// From above and from the side, a wall is closed where the cut through its opening's middle
+    /// is, not as far as the opening reaches anywhere.
+    #[test]
+    fn an_opening_is_cut_by_its_shape_and_not_by_its_bounding_box() {
+        let text = "name = \"c\"\norder = [1]\nwall_x_m = [8.0]\nwall_thickness_m = 0.5\n\
+                    corridor = { length_m = 20.0, width_m = 6.0, height_m = 7.0 }\nstart = \
+                    { offset_m = 1.5, jitter_y_m = 0.0, jitter_z_m = 0.0 }\n[[wall]]\nlabel = 1\n\
+                    shape = \"triangle\"\ncentre_m = [0.0, 3.5]\nwidth_m = 3.6\nheight_m = 3.2\n";
+        let course = Course::parse(text, "c.toml").unwrap();
+        let wall = &course.walls()[0];
+        let view = ViewedFrom::Above;
+        let (low_m, high_m) = view.opening_m(wall);
+        assert!((high_m - low_m - 3.6).abs() < 0.01, "{low_m} {high_m}");
+        let cut = view.open_in_cut_m(wall);
+        let &[(from_m, to_m)] = &cut[..] else {
+            panic!("a triangle is cut once: {cut:?}");
+        };
+        // Its base lies at 3.5 - 1.6 m and its width falls to zero over 3.2 m.
+        let width_m = 3.6 * (1.0 - (wall.safe_point()[1] - 1.9) / 3.2);
+        assert!((to_m - from_m - width_m).abs() < 0.01, "{cut:?}, {width_m}");
+
+        let mut canvas = Canvas::new(WIDTH, 500);
+        let panel = Panel {
+            course: &course,
+            view,
+            top: 20,
+        };
+        canvas.draw(|area| panel.draw(area, &[])).unwrap();
+        let colour = |across_m| canvas.colour_at(panel.at(8.25, across_m));
+        let partly_m = (to_m + high_m) / 2.0;
+        let found = [0.0, partly_m, -partly_m, high_m + 0.2].map(colour);
+        assert_eq!(found, [CORRIDOR, PARTLY_OPEN, PARTLY_OPEN, WALL]);
+    }
+
     #[test]
     fn an_impossible_position_is_named_by_its_line() {
         let directory = tempfile::tempdir().unwrap();

@@ -112,7 +112,7 @@ struct Arguments {
 
 const EXIT_STATUS: &str = "\
 Exit status: 0 all disturbances happened, and nothing differs, grew, is left or costs 3 % or more; \
-1 otherwise; 2 wrong arguments.";
+1 otherwise, 2 wrong arguments.";
 
 /// Settings of a soak test, unless overridden: a run that outlasts it, and a replay buffer whose
 /// two parts fill during the warm-up.
