@@ -27,7 +27,10 @@ const MOST_LINKS: usize = 40;
 /// The system's error, or what is wrong with the file and the remedy. Callers name the file.
 pub fn open(path: &Path, most: u64) -> io::Result<Take<File>> {
     // Opening a pipe would wait for its writer.
-    let about = fs::metadata(path)?;
+    let about = fs::metadata(path).map_err(|error| behind_link(path, error))?;
+    if about.is_dir() {
+        return Err(io::Error::other("it is a folder: name a file"));
+    }
     if !about.is_file() {
         return Err(io::Error::other(
             "it is not a regular file: name one, or move this aside",
@@ -40,6 +43,17 @@ pub fn open(path: &Path, most: u64) -> io::Result<Take<File>> {
         )));
     }
     Ok(File::open(path)?.take(most))
+}
+
+/// Returns `error`, with where `path` leads if it is a link to nothing.
+fn behind_link(path: &Path, error: io::Error) -> io::Error {
+    match fs::read_link(path) {
+        Ok(target) if error.kind() == io::ErrorKind::NotFound => io::Error::new(
+            error.kind(),
+            format!("it is a link to {}, which does not exist", target.display()),
+        ),
+        _ => error,
+    }
 }
 
 /// Reads the regular file at `path`, of at most `most` bytes.
@@ -92,10 +106,19 @@ mod tests {
         assert_eq!(read_text(&file, 4).unwrap(), "text");
         let error = read(&file, 3).unwrap_err().to_string();
         assert!(error.contains("4 bytes, more than the 3"), "{error}");
-        for strange in [Path::new("/dev/zero"), folder.path()] {
+        for (strange, problem) in [
+            (Path::new("/dev/zero"), "not a regular file"),
+            (folder.path(), "a folder: name a file"),
+        ] {
             let error = read_text(strange, SETTINGS_BYTES).unwrap_err().to_string();
-            assert!(error.contains("not a regular file"), "{error}");
+            assert!(error.contains(problem), "{error}");
         }
+        let link = folder.path().join("link");
+        symlink("nowhere", &link).unwrap();
+        let dangling = read(&link, 4).unwrap_err();
+        assert_eq!(dangling.kind(), io::ErrorKind::NotFound);
+        let problem = "a link to nowhere, which does not exist";
+        assert!(dangling.to_string().contains(problem), "{dangling}");
         let missing = read(&folder.path().join("missing"), 4).unwrap_err();
         assert_eq!(missing.kind(), io::ErrorKind::NotFound);
     }

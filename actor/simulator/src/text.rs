@@ -17,6 +17,9 @@ const MOST_BYTES: u64 = 1 << 20;
 /// a device might never end.
 pub(crate) fn read_text(path: &Path) -> io::Result<String> {
     let about = fs::metadata(path)?;
+    if about.is_dir() {
+        return Err(io::Error::other("it is a folder: name a file"));
+    }
     if !about.is_file() || about.len() > MOST_BYTES {
         return Err(io::Error::other(format!(
             "not a regular file of at most {MOST_BYTES} bytes"

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use tracing::level_filters::LevelFilter;
-use tracing_subscriber::filter::Targets;
+use tracing_subscriber::filter::{ParseError, Targets};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, fmt};
@@ -89,18 +89,37 @@ pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
 /// and a warning.
 fn filter(wanted: Option<&str>) -> (Targets, Option<String>) {
     let default = Targets::new().with_default(LevelFilter::INFO);
-    match wanted.map(str::parse) {
-        None => (default, None),
-        Some(Ok(filter)) => (filter, None),
-        Some(Err(error)) => {
+    let Some(wanted) = wanted else {
+        return (default, None);
+    };
+    let parsed = wanted
+        .parse()
+        .map_err(|error: ParseError| error.to_string());
+    match parsed.and_then(check_targets) {
+        Ok(filter) => (filter, None),
+        Err(problem) => {
             let fault = format!(
-                "RUST_LOG={} cannot be read: {error}; logging at level info. \
-                 Write it as \"debug\" or \"skein_actor=debug,info\"",
-                wanted.unwrap_or_default()
+                "RUST_LOG={wanted} cannot be read: {problem}; logging at level info. \
+                 Write it as \"debug\" or \"skein_actor=debug,info\""
             );
             (default, Some(fault))
         }
     }
+}
+
+/// Refuses a filter that names what can be no module: the parser takes any word for a module, and
+/// nothing at all would be logged.
+fn check_targets(filter: Targets) -> Result<Targets, String> {
+    let is_module = |name: &str| {
+        let part_of_one = |sign: char| sign.is_alphanumeric() || "_-:".contains(sign);
+        name.starts_with(|first: char| first.is_alphabetic() || first == '_')
+            && name.chars().all(part_of_one)
+    };
+    let unknown = filter
+        .iter()
+        .find(|(name, _)| !is_module(name))
+        .map(|(name, _)| format!("{name:?} is neither a level nor a module"));
+    unknown.map_or(Ok(filter), Err)
 }
 
 #[cfg(test)]
@@ -129,8 +148,21 @@ mod tests {
                 .contains("SKEIN_LOG_FORMAT=xml")
         );
 
-        let (fallen_back, fault) = filter(Some("skein_actor=loudly"));
-        assert!(fault.unwrap().contains("RUST_LOG=skein_actor=loudly"));
-        assert!(fallen_back.would_enable("skein_actor", &Level::INFO));
+        for malformed in [
+            "skein_actor=loudly",
+            "[[",
+            "debug;info",
+            "a b",
+            "=",
+            "{}=debug",
+        ] {
+            let (fallen_back, fault) = filter(Some(malformed));
+            let fault = fault.unwrap_or_else(|| panic!("{malformed} is taken"));
+            assert!(fault.contains(&format!("RUST_LOG={malformed} ")), "{fault}");
+            assert!(fallen_back.would_enable("skein_actor", &Level::INFO));
+        }
+        for sound in ["", "off", "trace", "skein_actor::service=debug", "2"] {
+            assert_eq!(filter(Some(sound)).1, None, "{sound}");
+        }
     }
 }

@@ -77,6 +77,9 @@ pub enum SuiteEntryError {
         "names its courses by {0} of the keys course, orders_of and generated: give it exactly one"
     )]
     Courses(usize),
+    /// A path that names nothing.
+    #[error("{0} = \"\" names no file: give the path of a course, relative to the suite")]
+    NoFile(&'static str),
     /// `first_seed` without generated courses.
     #[error("has first_seed but no generated courses: remove first_seed or add generated")]
     SeedWithoutGenerated,
@@ -246,6 +249,14 @@ fn names(name: &str) -> bool {
 fn courses(table: &EntryTable, folder: &Path) -> Result<EntryCourses, SuiteEntryError> {
     if table.first_seed.is_some() && table.generated.is_none() {
         return Err(SuiteEntryError::SeedWithoutGenerated);
+    }
+    for (key, file) in [("course", &table.course), ("orders_of", &table.orders_of)] {
+        if file
+            .as_ref()
+            .is_some_and(|file| file.as_os_str().is_empty())
+        {
+            return Err(SuiteEntryError::NoFile(key));
+        }
     }
     match (&table.course, &table.orders_of, &table.generated) {
         (Some(file), None, None) => Ok(EntryCourses::Listed(vec![Arc::new(Course::load(

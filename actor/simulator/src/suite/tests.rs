@@ -36,6 +36,13 @@ fn a_suite_is_used_whole_or_refused() {
             assert!(message.contains(part), "`{part}` is missing in {message}");
         }
     };
+    for key in ["course", "orders_of"] {
+        let named = format!("{key} = \"\" names no file");
+        refused(
+            &format!("{key} = \"\""),
+            &["x.toml", "entry \"one\"", &named],
+        );
+    }
     let corridor = "[entry.generated]\ncorridor = [60.0, 6.0, 7.0, 9.0]";
     refused(corridor, &["x.toml", "corridor"]);
     for (key, count) in [("clearance_m", 3), ("rotation_deg", 1)] {

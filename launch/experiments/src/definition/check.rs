@@ -60,6 +60,7 @@ pub(super) fn resolve(
     if let Some(episodes) = episodes {
         state_episodes(episodes, &mut settings, &mut arms);
     }
+    check_different(&arms, path)?;
     check_comparable(&arms, path)?;
     check_same_episodes(&file, &arms, path)?;
     check_same_reward(&file, &arms, path)?;
@@ -270,6 +271,21 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
 /// Returns `value` as it stands in the file.
 fn as_written(value: &impl Serialize) -> String {
     Value::try_from(value).map_or_else(|error| error.to_string(), |value| value.to_string())
+}
+
+/// Refuses two arms that are the same training.
+fn check_different(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
+    for (number, arm) in arms.iter().enumerate() {
+        if let Some(same) = arms[..number].iter().find(|same| same.config == arm.config) {
+            let problem = format!(
+                "is the same training as arm {}, so there is nothing to compare: change a \
+                 setting of one, or remove it",
+                same.name
+            );
+            return Err(settings_error(path, &format!("arm {}", arm.name), problem));
+        }
+    }
+    Ok(())
 }
 
 /// Refuses arms that are evaluated differently.

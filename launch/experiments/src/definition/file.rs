@@ -1,6 +1,7 @@
 //! The file of an experiment, as written.
 
 use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -117,9 +118,12 @@ fn known(folder: &Path, name: &str) -> Result<PathBuf, DefinitionError> {
 }
 
 pub(super) fn read(path: &Path) -> Result<ExperimentFile, DefinitionError> {
-    let text = files::read_text(path, SETTINGS_BYTES).map_err(|source| DefinitionError::Read {
-        path: path.to_owned(),
-        source,
+    let text = files::read_text(path, SETTINGS_BYTES).map_err(|source| {
+        let path = path.to_owned();
+        match source.kind() {
+            io::ErrorKind::NotFound => DefinitionError::Missing { path, source },
+            _ => DefinitionError::Read { path, source },
+        }
     })?;
     parse_whole(&text).map_err(|source| match integer_too_large(&text, &source) {
         Some(problem) => DefinitionError::Integer {

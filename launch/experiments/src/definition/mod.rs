@@ -157,6 +157,19 @@ pub enum DefinitionError {
         #[source]
         source: std::io::Error,
     },
+    /// The experiment's file does not exist.
+    #[error(
+        "cannot read {}: {source}; give the path of an experiment's file, FOLDER/NAME.toml, or \
+         one of the names that skein experiment --list prints",
+        path.display()
+    )]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// The operating system's error.
+        #[source]
+        source: std::io::Error,
+    },
     /// No experiment has this name.
     #[error(
         "no experiment is called {name}: {} holds {known}; give one of these names, \

@@ -316,6 +316,11 @@ fn an_invalid_experiment_is_refused_with_file_key_value_and_remedy() {
             vec!["arm.name = a occurs twice"],
         ),
         (
+            head() + ARM + &ARM.replace("\"a\"", "\"b\"").replace("\"A\"", "\"B\""),
+            None,
+            vec!["arm b: is the same training as arm a", "or remove it"],
+        ),
+        (
             head() + &ARM.replace("\"a\"", "\"../a\""),
             None,
             vec!["arm.name = \"../a\"", "letter or digit"],
@@ -574,4 +579,22 @@ fn an_unknown_name_is_refused_with_the_known_names() {
         "{error}"
     );
     assert!(Experiment::load(&shipped("experiments"), "../smoke", None).is_err());
+}
+
+#[test]
+fn a_missing_file_and_a_link_to_nothing_are_refused_with_what_to_give() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("f.toml");
+    let refused = |named: &str, problem: &str| {
+        let error = Experiment::load(folder.path(), named, None).unwrap_err();
+        let error = error.to_string();
+        for part in [path.to_str().unwrap(), problem, "skein experiment --list"] {
+            assert!(error.contains(part), "`{error}` does not mention `{part}`");
+        }
+    };
+    refused(path.to_str().unwrap(), "No such file");
+    std::os::unix::fs::symlink("g.toml", &path).unwrap();
+    for named in ["f", path.to_str().unwrap()] {
+        refused(named, "a link to g.toml, which does not exist");
+    }
 }
