@@ -155,6 +155,11 @@ impl Training<'_> {
     /// Waits for the oldest order, learns from it, and publishes the result.
     fn learn_from_flown(&mut self) -> Result<(), TrainingError> {
         let flown = self.collect()?;
+        self.learn_from(flown)
+    }
+
+    /// Learns from what was flown by one order, and publishes the result.
+    fn learn_from(&mut self, flown: Vec<CommittedEpisode>) -> Result<(), TrainingError> {
         self.take_in(flown)?;
         let before = self.trainer.all_updates();
         self.train_vae()?;

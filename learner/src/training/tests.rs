@@ -7,6 +7,8 @@ use tempfile::TempDir;
 use super::*;
 use crate::checkpoint::{BestSnapshot, EpisodeWalls};
 use crate::episode::samples;
+use crate::error::UpdateError;
+use crate::trainer::MetricMeans;
 
 /// A run that has just begun, without actors.
 struct BegunRun {
@@ -212,4 +214,78 @@ fn a_run_counts_as_trained_from_the_configured_rate_on_and_only_once() {
     training.progress.episodes = 10;
     training.note_trained(&passed(4));
     assert_eq!(training.progress.trained.unwrap().episodes, 0);
+}
+
+/// The VAE is frozen in the first epoch. The policy must learn from the codes computed again then,
+/// and the snapshot must hold what both learned.
+#[test]
+fn an_epoch_trains_the_vae_then_the_policy_and_publishes_both() {
+    let run = BegunRun::new(|config| {
+        (config.run.episodes, config.learning.episodes_per_epoch) = (4, 2);
+        (config.learning.warmup_steps, config.sac.batch_size) = (4, 4);
+        config.learning.updates_per_step = 0.25;
+        config.vae.train_steps = 15;
+        (config.vae.updates_per_step, config.vae.batch_size) = (0.2, 2);
+    });
+    let mut training = run.begin();
+    let mut by_hand = Trainer::new(&run.config).unwrap();
+    for epoch in 0..2 {
+        let episode = |number| {
+            let mut flown = samples::episode(2 * epoch + number, 10, Outcome::Collided);
+            flown.rewards.fill(0.5);
+            samples::with_images(flown)
+        };
+        training.learn_from([0, 1].map(episode).to_vec()).unwrap();
+
+        (0..2).for_each(|number| by_hand.take_in(episode(number)).unwrap());
+        let (version, mut timer) = (PolicyVersion(epoch), LapTimer::start());
+        by_hand
+            .train_vae(version, &mut timer, |_| Ok::<_, UpdateError>(()))
+            .unwrap();
+        let means = &mut MetricMeans::default();
+        by_hand
+            .train_policy(version, &mut timer, means, |_| Ok::<_, UpdateError>(()))
+            .unwrap();
+        let expected = by_hand.snapshot(PolicyVersion(epoch + 1));
+        let published = training.snapshots.keys().next_back();
+        assert_eq!(published, Some(&expected.version));
+        assert!(
+            training.snapshots[&expected.version] == expected,
+            "epoch {epoch}"
+        );
+    }
+    let trainer = &training.trainer;
+    assert_eq!((trainer.vae_updates(), trainer.updates()), (3, 9));
+    assert_eq!(training.progress.episodes, 4);
+}
+
+#[test]
+fn an_episode_in_segments_is_counted_once_and_recorded_whole() {
+    let run = BegunRun::new(|config| {
+        config.learning.segment_steps = 4;
+        config.learning.episodes_per_epoch = 1;
+        config.learning.warmup_steps = 1000;
+        config.replay.success_share = 0.0;
+        config.transport.max_records_per_episode = 40;
+        config.simulator.insert("max_steps".to_owned(), 30.into());
+    });
+    let mut training = run.begin();
+    let mut counted = Vec::new();
+    for (first_step, outcome) in [(0, None), (4, None), (8, Some(Outcome::Collided))] {
+        let mut segment = samples::with_images(samples::episode(0, 4, Outcome::Collided));
+        (segment.first_step, segment.outcome) = (first_step, outcome);
+        training.learn_from(vec![segment]).unwrap();
+        let open = training.open_episode.as_ref();
+        counted.push((
+            training.progress.episodes,
+            training.metrics.state().episodes,
+            open.map(CommittedEpisode::steps),
+        ));
+    }
+    assert_eq!(counted, [(0, 0, Some(4)), (0, 0, Some(8)), (1, 1, None)]);
+    assert_eq!(training.trainer.steps(), 12);
+    training.metrics.flush().unwrap();
+    let rows = std::fs::read_to_string(run.directory.episodes_csv()).unwrap();
+    let row: Vec<_> = rows.lines().nth(1).unwrap().split(',').collect();
+    assert_eq!(row[5], "12", "steps in {rows}");
 }
