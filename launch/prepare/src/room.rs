@@ -29,8 +29,8 @@ const FILES_PER_ACTOR: u64 = 10;
 /// `tests/small.toml` has 73.1 MB, `latest.safetensors` 3.2 MB.
 const CHECKPOINT_SNAPSHOTS: u64 = 24;
 
-/// Address space of a learner without what it learns with, in bytes: libraries, stacks, and what the
-/// allocator reserves. Measured with `configs/smoke.toml` and two threads, where all adds up to 915
+/// Address space of a learner without what it learns with, in bytes: libraries, stacks, and what
+/// the allocator reserves. Measured with `configs/smoke.toml` and two threads, where the sum is 915
 /// MiB: the transport of a learner with 781 MiB fails, one with 830 MiB begins, one without a limit
 /// reaches 1120 MiB in the end.
 const ADDRESS_SPACE: u64 = 600 << 20;

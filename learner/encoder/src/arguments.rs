@@ -25,9 +25,10 @@ pub struct Arguments {
     pub measure: Option<PathBuf>,
     /// Change one setting of the config, for example --set encoder.steps=2000; may be repeated.
     ///
-    /// These have an effect: [encoder]; vae.latent, batch_size, learning_rate and kl_weight; camera,
-    /// generator, the vehicle's preset and the disturbances' share and depth of [simulator];
-    /// run.seed and run.learner_threads. With --measure, those of [simulator] and [run].
+    /// These have an effect: [encoder]; latent, batch_size, learning_rate and kl_weight of [vae];
+    /// camera, generator, the vehicle's preset and the disturbances' share and depth of
+    /// [simulator]; run.seed and run.learner_threads. With --measure, those of [simulator] and
+    /// [run].
     #[arg(long = "set", value_name = "SECTION.KEY=VALUE")]
     pub overrides: Vec<String>,
 }

@@ -3,7 +3,9 @@
 use rand::RngExt;
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
-use skein_protocol::config::{AlgorithmName, DecoderName, EncoderTraining, Observation};
+use skein_protocol::config::{
+    AlgorithmName, DecoderName, EncoderTraining, Observation, TeacherName,
+};
 use skein_protocol::transition::Outcome;
 
 use super::*;
@@ -251,6 +253,21 @@ fn the_policy_average_flies_where_configured_and_does_not_change_learning() {
         "the average over one update is the latest policy: {}",
         distance(&of_one)
     );
+    // Its first updates weigh more: the policy that nothing has taught is forgotten.
+    let untaught = {
+        let trainer = Trainer::new(&config()).unwrap();
+        trainer.snapshot(PolicyVersion(0)).values[trainer.layout.policy()].to_vec()
+    };
+    let from_untaught = |policy: &[f32]| -> f32 {
+        let pairs = policy.iter().zip(&untaught);
+        pairs.map(|(one, other)| (one - other).abs()).sum()
+    };
+    assert!(
+        from_untaught(&of_many) > 0.5 * from_untaught(&latest),
+        "{} of {}",
+        from_untaught(&of_many),
+        from_untaught(&latest)
+    );
     assert!(
         distance(&of_many) > 1e-4,
         "the average over many updates lags behind: {}",
@@ -439,6 +456,21 @@ fn updates_count_from_the_warm_up_and_vae_steps_to_the_freeze_to_the_step() {
         (80, 15, 4, Sample, Latents),
     ];
     assert_eq!(due(&config), at_the_end);
+}
+
+#[test]
+fn the_teachers_share_falls_with_the_steps_flown_and_is_none_without_a_teacher() {
+    let mut config = config();
+    assert_eq!(Trainer::new(&config).unwrap().teacher_share(), None);
+    config.teacher.policy = TeacherName::Oracle;
+    (config.teacher.flown_share, config.teacher.flown_steps) = (0.5, 2 * STEPS as u64);
+    let mut trainer = Trainer::new(&config).unwrap();
+    let mut shares = vec![trainer.teacher_share()];
+    for epoch in 0..2 {
+        learn(&mut trainer, epoch, KeptData::Depth);
+        shares.push(trainer.teacher_share());
+    }
+    assert_eq!(shares, [Some(0.5), Some(0.25), Some(0.0)]);
 }
 
 #[test]

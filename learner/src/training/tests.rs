@@ -124,6 +124,20 @@ fn a_checkpoint_is_due_every_so_many_episodes_since_the_last() {
     assert_eq!(saved, [0, 20, 20, 40]);
 }
 
+/// A run stopped after a confirmation must not fly it again.
+#[test]
+fn a_checkpoint_holds_the_last_candidate_even_if_no_epoch_followed_the_one_before() {
+    let run = BegunRun::new(|_| {});
+    let mut training = run.begin();
+    training.skip_epoch();
+    training.checkpoint().unwrap();
+    assert_eq!(training.saved.latest_candidate, None);
+    training.find_best();
+    training.checkpoint().unwrap();
+    assert_eq!(training.saved.latest_candidate, Some(10));
+    assert_eq!(training.saved.best, training.progress.best);
+}
+
 #[test]
 fn as_many_epochs_are_ordered_ahead_as_the_policy_lags_and_none_beyond_the_end() {
     for (lag, expected) in [
