@@ -39,7 +39,8 @@ while (($# > 0)); do
     --executions) executions=$(number "$1" "${2:-}") && shift ;;
     --jobs) jobs=$(number "$1" "${2:-}") && shift ;;
     --target) chosen+=("${2:?--target takes a name}") && shift ;;
-    *) seconds=$(number "SECONDS" "$1") ;;
+    -*) fail "unknown argument \"$1\"" ;;
+    *) seconds=$(number SECONDS "$1") ;;
     esac
     shift
 done

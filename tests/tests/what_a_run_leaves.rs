@@ -63,8 +63,8 @@ fn a_plot_that_cannot_be_drawn_hides_no_failure_of_the_run() {
             fs::write(file.unwrap().path(), "damaged").unwrap();
         }
     }
-    // Garbage instead of a table fails to be drawn, whatever the folder of the plots is.
-    fs::write(running.directory().episodes_csv(), "\u{0}").unwrap();
+    // A folder in a plot's place.
+    fs::create_dir_all(running.directory().plots().join("return.png")).unwrap();
     running.resume(1);
     let ended = running.wait();
     let stderr = &ended.output.stderr;

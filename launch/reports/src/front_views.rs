@@ -276,7 +276,7 @@ mod tests {
             "shape = \"l\"\nwidth_m = 3.0\nheight_m = 3.0\narm_m = 1.8",
         );
         let circle = "shape = \"circle\"\ndiameter_m = 2.2";
-        for (shape, closed_corners) in [(circle, 4), (triangle, 4), (l, 1)] {
+        for (shape, closed_corners) in [(circle, 4), (triangle, 2), (l, 1)] {
             let course = course_of(1, shape);
             let wall = &course.walls()[0];
             let view = FrontView {

@@ -1,5 +1,10 @@
 //! Signals to the program `skein-encoder`.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
+
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;

@@ -254,11 +254,7 @@ impl DepthNoiseSettings {
             }
         }
         if !(range_m > 0.0 && range_m.is_finite()) {
-            return Err(fault(
-                "depth.model",
-                range_m,
-                "needs a camera.range_m that is positive and finite".to_owned(),
-            ));
+            return Ok(()); // the camera refuses it
         }
         // σ is least or greatest at the parabola's vertex or at an end of the range.
         let vertex_m =
