@@ -13,7 +13,8 @@ ratio, and the machine. Figures and their baselines are measured by the same run
 
 Options:
   --quick       a fraction of a second for each, to see that they work: no time is judged, and results lie in target/bench-quick/
-  --only NAME   this benchmark alone; may be repeated. tests/bench/benchmarks.toml names them
+  --only NAME   this benchmark alone; may be repeated. tests/bench/benchmarks.toml names them. sac_peer runs only if it is named: it
+                compares with JAX, which it installs into target/bench-python/ (630 MB)
   --growth      measure as well how cost grows with the episodes of an epoch, and draw all growth into docs/pictures/
   -h, --help    this text
 
@@ -68,6 +69,13 @@ if command -v taskset >/dev/null; then
     pin=(taskset --cpu-list "$(taskset --cpu-list --pid $$ | grep -o '[0-9]*$')")
 else
     echo "bench.sh: taskset (util-linux) is missing: nothing is pinned to a core, and times scatter" >&2
+fi
+
+if grep -q '^sac_peer ' <<<"$benches"; then
+    python=$target/bench-python
+    [[ -x $python/bin/python ]] || python3 -m venv "$python"
+    "$python/bin/pip" install --quiet --disable-pip-version-check jax==0.10.2 optax==0.2.8
+    export SKEIN_PEER_PYTHON=$python/bin/python
 fi
 
 named=()

@@ -7,8 +7,11 @@ use std::sync::Arc;
 use anyhow::Context;
 use clap::Parser;
 use skein_actor::service::{ExitReason, Service};
+use skein_inference::Network;
 use skein_kernels::Isa;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
+use skein_protocol::policy_file::teacher_policy;
+use skein_protocol::snapshot::SnapshotLayout;
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::{Courses, Simulators};
 use skein_rollout::environment_loop::EnvironmentLoop;
@@ -93,5 +96,11 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
         simulators,
         Agent::new(config.observation_layout()),
     );
+    if let Some((snapshot, trained)) = teacher_policy(&config)? {
+        environment_loop = environment_loop.with_teacher(
+            Network::new(&snapshot, &SnapshotLayout::of(&trained)),
+            Agent::new(trained.observation_layout()),
+        );
+    }
     Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use skein_protocol::config::EvaluationSection;
+use skein_protocol::config::ParameterKey;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::files::{self, REPORT_BYTES};
 use skein_protocol::stages::StageTimes;
@@ -122,7 +123,15 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
     [
         (run.config(), "the resolved configuration"),
         (run.courses(), "courses of the run"),
-        (run.encoder(), "the encoder that the run started from"),
+        (
+            run.parameters(ParameterKey::Encoder),
+            "the encoder that the run started from",
+        ),
+        (
+            run.parameters(ParameterKey::Policy),
+            "the policy that the run started from",
+        ),
+        (run.parameters(ParameterKey::Teacher), "the teacher"),
         (run.episodes_csv(), "one row per training episode"),
         (run.evaluation_json(), "the evaluation above"),
         (

@@ -11,7 +11,7 @@ use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-/// Width of an observation, as in `local.toml`.
+/// Width of an observation, as in `one-course.toml`.
 const OBSERVATION: usize = 34;
 /// Default width of hidden layers.
 const WIDTH: usize = 256;

@@ -8,7 +8,7 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::VaeSection;
 use tch::Device;
 
-/// Images per batch, as in `local.toml`.
+/// Images per batch, as in `one-course.toml`.
 const BATCH: usize = 16;
 
 fn main() {

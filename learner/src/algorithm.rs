@@ -45,6 +45,12 @@ pub trait Algorithm: Stateful + fmt::Debug {
     /// Names and shapes of the parameters that [`Algorithm::publish`] copies.
     fn policy_layout(&self) -> &Layout;
 
+    /// Replaces the untrained policy by these parameters, in the snapshot layout's order.
+    ///
+    /// # Panics
+    /// When `policy` is not as long as the layout.
+    fn start_from(&mut self, policy: &[f32]);
+
     /// Copies the policy's part of a snapshot, in the snapshot layout's order.
     ///
     /// # Panics

@@ -30,18 +30,10 @@ pub(crate) fn is_candidate(
             .is_some_and(|mean| mean > 0.0 && mean >= threshold)
 }
 
-/// `true` if a confirmed candidate replaces the best: more walls passed in confirmation episodes,
-/// or equally many and a better training average.
+/// `true` if a confirmed candidate replaces the best: at least as many walls passed in confirmation
+/// episodes. Of equals the newest counts, because it has learned from most.
 pub(crate) fn is_better(candidate: &BestSnapshot, best: Option<&BestSnapshot>) -> bool {
-    best.is_none_or(|best| {
-        let rank = |snapshot: &BestSnapshot| {
-            (
-                snapshot.confirmed_walls_passed(),
-                snapshot.window_walls_passed,
-            )
-        };
-        rank(candidate) > rank(best)
-    })
+    best.is_none_or(|best| candidate.confirmed_walls_passed() >= best.confirmed_walls_passed())
 }
 
 /// Returns the number of confirmation episodes flown before the next look at them, after `flown`:
@@ -174,11 +166,10 @@ mod tests {
     }
 
     #[test]
-    fn evaluation_episodes_decide_and_training_episodes_break_ties() {
+    fn evaluation_episodes_decide_and_of_equals_the_newest_is_best() {
         assert!(is_better(&best(1.0, 3.0), None));
         assert!(is_better(&best(1.0, 3.5), Some(&best(2.0, 3.0))));
         assert!(!is_better(&best(2.0, 3.0), Some(&best(1.0, 3.5))));
-        assert!(is_better(&best(2.0, 3.0), Some(&best(1.0, 3.0))));
-        assert!(!is_better(&best(1.0, 3.0), Some(&best(1.0, 3.0))));
+        assert!(is_better(&best(1.0, 3.0), Some(&best(2.0, 3.0))));
     }
 }

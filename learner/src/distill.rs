@@ -135,6 +135,10 @@ impl Algorithm for Distill {
         &self.layout
     }
 
+    fn start_from(&mut self, policy: &[f32]) {
+        self.parameters.values.copy_from_slice(policy);
+    }
+
     fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.parameters.values);
     }

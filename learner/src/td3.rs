@@ -192,6 +192,10 @@ impl Algorithm for Td3 {
         self.policy_parameters.layout()
     }
 
+    fn start_from(&mut self, policy: &[f32]) {
+        self.policy_parameters.replace(policy);
+    }
+
     fn publish(&self, into: &mut [f32]) {
         self.policy_parameters
             .copy_range(0..self.policy_layout().len(), into);

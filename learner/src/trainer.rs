@@ -12,6 +12,7 @@ use skein_kernels::{Isa, Team};
 use skein_protocol::config::{AlgorithmName, Config, Engine};
 use skein_protocol::encoder_file::{EncoderError, TrainedEncoder};
 use skein_protocol::ids::PolicyVersion;
+use skein_protocol::policy_file::{PolicyError, start_policy};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
@@ -46,6 +47,9 @@ pub enum TrainerError {
     /// The configured encoder cannot be used.
     #[error(transparent)]
     Encoder(#[from] EncoderError),
+    /// The policy to start from cannot be used.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
 }
 
 /// Reason why a stored state cannot be restored.
@@ -89,6 +93,13 @@ impl EncoderSource {
         match self {
             Self::Vae(vae) => Some(vae),
             Self::File(_) | Self::Algorithm => None,
+        }
+    }
+
+    fn file(&self) -> Option<&TrainedEncoder> {
+        match self {
+            Self::File(encoder) => Some(encoder),
+            Self::Vae(_) | Self::Algorithm => None,
         }
     }
 
@@ -164,7 +175,10 @@ impl Trainer {
             threads,
             "engines chosen"
         );
-        let algorithm = new_algorithm(config, device);
+        let mut algorithm = new_algorithm(config, device);
+        if let Some(policy) = start_policy(config, source.file())? {
+            algorithm.start_from(&policy);
+        }
         let averaged = config.learning.average_updates;
         Ok(Self {
             layout: SnapshotLayout::of(config),

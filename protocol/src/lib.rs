@@ -12,6 +12,7 @@ pub mod encoder_file;
 pub mod evaluation;
 pub mod files;
 pub mod ids;
+pub mod policy_file;
 pub mod progress;
 pub mod seeds;
 pub mod segment;

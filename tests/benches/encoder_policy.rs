@@ -17,7 +17,7 @@ use skein_protocol::snapshot::{
 use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_LATENT};
 use tch::Device;
 
-/// Settings of `local.toml`.
+/// Settings of `one-course.toml`.
 const OBSERVATION: Observation = Observation::LatentVelocity;
 const STRIDE: usize = 2;
 

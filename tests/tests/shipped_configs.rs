@@ -38,10 +38,10 @@ fn the_shipped_configurations_exist() {
     assert_eq!(
         names,
         [
-            "distill.toml",
             "encoder.toml",
             "generalist.toml",
             "local.toml",
+            "one-course.toml",
             "paper.toml",
             "smoke.toml"
         ]

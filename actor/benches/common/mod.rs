@@ -12,7 +12,7 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_run::{LearnerLock, RunDirectory, RunIdentity};
 use skein_transport::LearnerPorts;
 
-/// Observation of `local.toml`.
+/// Observation of `one-course.toml`.
 pub(crate) const OBSERVATION: Observation = Observation::LatentVelocity;
 
 /// Run whose only learner is this process.

@@ -1,14 +1,14 @@
 //! The agent: from camera image to action.
 
 use rand::{Rng, RngExt};
-use skein_protocol::ACTION;
 use skein_protocol::config::ObservationLayout;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
+use skein_protocol::{ACTION, LatentCode};
 use skein_simulator::simulator::Simulator;
 
-use skein_inference::{Network, Scratch};
+use skein_inference::{ActionDistribution, Network, Scratch};
 
 /// Working memory of one thread that observes and acts.
 #[derive(Debug)]
@@ -62,34 +62,54 @@ impl Agent {
         previous_action: &[f32; ACTION],
         noise: &mut impl Rng,
     ) -> [f32; ACTION] {
-        self.remember(record, previous_action);
-        let mut distribution = || {
-            let Self {
-                layout,
-                step_inputs,
-                observed,
-                scratch,
-            } = self;
-            let len = layout.step_len();
-            layout.write(record.step as usize, observed, |step, into| {
-                into.copy_from_slice(&step_inputs[step * len..][..len]);
-            });
-            network.distribution(observed, scratch)
-        };
+        self.remember(record, &record.latent, previous_action);
         match exploration {
             Exploration::Uniform => std::array::from_fn(|_| noise.random_range(-1.0..=1.0)),
-            Exploration::Sample => distribution().sample(noise),
-            Exploration::Mode => distribution().mode(),
+            Exploration::Sample => self.distribution(record, network).sample(noise),
+            Exploration::Mode => self.distribution(record, network).mode(),
         }
     }
 
+    /// Returns what another policy, with an encoder of its own, would do for the image in `record`,
+    /// without noise. Call it as [`Agent::act`], on an agent that nothing else is asked of.
+    pub fn advise(
+        &mut self,
+        network: &Network,
+        record: &TransitionRecord,
+        previous_action: &[f32; ACTION],
+    ) -> [f32; ACTION] {
+        let latent = network.encode(&record.depth, &mut self.scratch);
+        self.remember(record, &latent, previous_action);
+        self.distribution(record, network).mode()
+    }
+
+    /// Returns the policy's distribution of actions in the step of `record`, which is remembered.
+    fn distribution(&mut self, record: &TransitionRecord, network: &Network) -> ActionDistribution {
+        let Self {
+            layout,
+            step_inputs,
+            observed,
+            scratch,
+        } = self;
+        let len = layout.step_len();
+        layout.write(record.step as usize, observed, |step, into| {
+            into.copy_from_slice(&step_inputs[step * len..][..len]);
+        });
+        network.distribution(observed, scratch)
+    }
+
     /// Stores the input of the step in `record`, and drops the inputs of earlier episodes.
-    fn remember(&mut self, record: &TransitionRecord, previous_action: &[f32; ACTION]) {
+    fn remember(
+        &mut self,
+        record: &TransitionRecord,
+        latent: &LatentCode,
+        previous_action: &[f32; ACTION],
+    ) {
         let len = self.layout.step_len();
         let first = record.step as usize * len;
         self.step_inputs.resize(first + len, 0.0);
         self.layout.write_step(
-            &record.latent,
+            latent,
             &record.velocity_mps,
             previous_action,
             &mut self.step_inputs[first..],

@@ -40,6 +40,8 @@ pub struct EnvironmentLoop {
     simulators: Simulators,
     reward: RewardSettings,
     agent: Agent,
+    /// Teacher of tickets that ask for one; `None`: the oracle.
+    teacher: Option<(Network, Agent)>,
     /// The episode that the last ticket's segment left unfinished.
     paused: Option<PausedEpisode>,
 }
@@ -59,8 +61,17 @@ impl EnvironmentLoop {
             simulators,
             reward,
             agent,
+            teacher: None,
             paused: None,
         }
+    }
+
+    /// Makes a trained policy the teacher, in the oracle's place. The agent sees what the policy
+    /// saw in training.
+    #[must_use]
+    pub fn with_teacher(mut self, policy: Network, agent: Agent) -> Self {
+        self.teacher = Some((policy, agent));
+        self
     }
 
     /// Marks records with `incarnation` from now on.
@@ -114,7 +125,10 @@ impl EnvironmentLoop {
             );
             let action = match ticket.teacher_share {
                 Some(share) => {
-                    record.teacher_action = simulator.oracle_action();
+                    record.teacher_action = match &mut self.teacher {
+                        Some((policy, agent)) => agent.advise(policy, &record, &previous_action),
+                        None => simulator.oracle_action(),
+                    };
                     match teacher_steps.random::<f32>() < share {
                         true => record.teacher_action,
                         false => own_action,

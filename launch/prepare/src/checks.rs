@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use skein_protocol::config::{Config, ConfirmOn, failing_override};
 use skein_protocol::encoder_file::TrainedEncoder;
+use skein_protocol::policy_file::{start_policy, teacher_policy};
 use skein_simulator::course::Course;
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::text::first_repeated;
@@ -52,10 +53,16 @@ pub fn check(
                 source,
             })?;
     }
-    TrainedEncoder::of(config).map_err(|source| PrepareError::Encoder {
+    let encoder = TrainedEncoder::of(config).map_err(|source| PrepareError::Encoder {
         config: in_file(),
         source,
     })?;
+    start_policy(config, encoder.as_ref())
+        .and_then(|_| teacher_policy(config))
+        .map_err(|source| PrepareError::Policy {
+            config: in_file(),
+            source,
+        })?;
     check_level_count(
         config_file,
         config,

@@ -86,17 +86,13 @@ impl NewDirectory {
     }
 }
 
-/// Copies course files and encoder into the run's directory and makes the configuration refer to
-/// the copies, so that the run stays reproducible when the originals change.
+/// Copies the files of courses and parameters into the run's directory and makes the configuration
+/// refer to the copies, so that the run stays reproducible when the originals change.
 pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), PrepareError> {
     let run = RunDirectory::new(root);
-    if let Some(encoder) = &mut config.vae.start_from {
-        copy(encoder, run.encoder())?;
-        *encoder = run
-            .encoder()
-            .file_name()
-            .map(PathBuf::from)
-            .unwrap_or_default();
+    for (key, path) in config.parameter_files_mut() {
+        copy(path, run.parameters(key))?;
+        *path = key.copy().into();
     }
     let folder = run.courses();
     let mut copies: BTreeMap<OsString, PathBuf> = BTreeMap::new();

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use skein_protocol::config::ConfigError;
 use skein_protocol::encoder_file::EncoderError;
+use skein_protocol::policy_file::PolicyError;
 use skein_run::RunError;
 use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
@@ -46,6 +47,15 @@ pub enum PrepareError {
         /// Problem of the encoder's file.
         #[source]
         source: EncoderError,
+    },
+    /// The policy to start from, or the teacher's, cannot be used.
+    #[error("{}: {source}", config.display())]
+    Policy {
+        /// The configuration file.
+        config: PathBuf,
+        /// Problem of the policy's file.
+        #[source]
+        source: PolicyError,
     },
     /// The given ranges do not allow courses to be generated.
     #[error("{}: [simulator.generator] {source}", config.display())]

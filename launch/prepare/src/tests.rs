@@ -5,6 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
+use skein_protocol::config::ParameterKey;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
@@ -77,10 +78,13 @@ fn a_run_keeps_the_encoder_that_it_starts_from() {
     let prepared = start().unwrap();
     fs::remove_file(&original).unwrap();
     let (identity, config) = prepared.run.open().unwrap();
-    assert!(identity.encoder.is_some());
-    assert_eq!(config.vae.start_from, Some(prepared.run.encoder()));
+    assert!(identity.parameters.contains_key("encoder.safetensors"));
+    assert_eq!(
+        config.vae.start_from,
+        Some(prepared.run.parameters(ParameterKey::Encoder))
+    );
     assert_eq!(TrainedEncoder::of(&config).unwrap(), Some(trained));
-    let copy = fs::metadata(prepared.run.encoder()).unwrap();
+    let copy = fs::metadata(prepared.run.parameters(ParameterKey::Encoder)).unwrap();
     assert_eq!(copy.permissions().mode() & 0o777, 0o600);
 }
 

@@ -35,7 +35,7 @@ const LEARNING_RATE: f64 = 1e-3;
 /// Share of the range of `simulator.generator.clearance_m` that the row of narrow openings has.
 const NARROWEST: f32 = 0.1;
 /// Distances to the next wall, metres; a drone steers by the nearer ones.
-const BANDS_M: [[f32; 2]; 3] = [[0.6, 2.0], [2.0, 4.0], [4.0, 8.0]];
+const BANDS_M: [[f32; 2]; 4] = [[0.6, 2.0], [2.0, 4.0], [4.0, 8.0], [8.0, 16.0]];
 
 /// Errors of a probe, by kind of view.
 #[derive(Debug)]
@@ -47,7 +47,7 @@ pub struct Measurement {
 #[derive(Debug)]
 struct RowErrors {
     /// Offset of the next opening at its true distance, per axis, by distance.
-    offset_m: [f64; 3],
+    offset_m: [f64; 4],
     /// Distance of the next wall, within the farthest band.
     distance_m: f64,
     /// Clearance of the next opening, likewise.
@@ -232,15 +232,18 @@ impl fmt::Display for Measurement {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "Root mean square errors of openings found from the code, m:\n{:20} {:>29} {:>9} {:>9} \
+            "Root mean square errors of openings found from the code, m:\n{:20} {:>34} {:>8} {:>9} \
              {:>14}",
-            "", "offset at 0.6–2, 2–4, 4–8 m", "distance", "clearance", "offset of next"
+            "", "offset at 0.6–2, 2–4, 4–8, 8–16 m", "distance", "clearance", "offset of next"
         )?;
         let rows = self.rows.iter().map(|(name, errors)| {
-            let [near, middle, far] = errors.offset_m;
+            let offsets = errors.offset_m.map(|error| format!("{error:7.3}"));
             format!(
-                "{name:20} {near:9.3} {middle:9.3} {far:9.3} {:9.3} {:9.3} {:14.3}",
-                errors.distance_m, errors.clearance_m, errors.after_offset_m
+                "{name:20} {:>34} {:8.3} {:9.3} {:14.3}",
+                offsets.join(" "),
+                errors.distance_m,
+                errors.clearance_m,
+                errors.after_offset_m
             )
         });
         f.write_str(&rows.collect::<Vec<_>>().join("\n"))

@@ -130,7 +130,7 @@ impl<'a> Training<'a> {
         let mut noise = Noise::new(derive(seed, Purpose::EncoderNoise, step));
         self.vae.set_learning_rate(learning_rate(config, step));
         let targets = Targets {
-            clean: Some(&views.clean),
+            clean: Some(&views.clean[..reproduced(config) * IMAGE_PIXELS]),
             geometry: &views.known,
         };
         let updated = self
@@ -193,6 +193,12 @@ fn new_vae(config: &Config) -> NativeVae {
     let (run, weight) = (&config.run, config.encoder.geometry_weight);
     let head = (KNOWN, weight);
     NativeVae::supervised(&config.vae, run.seed, run.learner_threads, head)
+}
+
+/// Returns the number of images of a minibatch that the decoder reproduces, at least one.
+fn reproduced(config: &Config) -> usize {
+    let images = config.vae.batch_size as f64 * config.encoder.reproduced_share;
+    (images.ceil() as usize).max(1)
 }
 
 /// Returns Adam's step size of the step after `step` steps: constant, and then falling linearly.

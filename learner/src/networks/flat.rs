@@ -178,6 +178,15 @@ impl Parameters {
         let _ = self.flat.lerp_(&leader.flat, rate);
     }
 
+    /// Replaces all values.
+    ///
+    /// # Panics
+    /// When `values` has another length.
+    pub fn replace(&mut self, values: &[f32]) {
+        let _guard = no_grad_guard();
+        self.flat.copy_(&Tensor::from_slice(values));
+    }
+
     /// Copies a range of the parameters.
     ///
     /// # Panics

@@ -368,6 +368,10 @@ impl Algorithm for NativeSac {
         &self.policy_layout
     }
 
+    fn start_from(&mut self, policy: &[f32]) {
+        self.policy_parameters.values.copy_from_slice(policy);
+    }
+
     fn publish(&self, into: &mut [f32]) {
         into.copy_from_slice(&self.policy_parameters.values);
     }

@@ -4,7 +4,7 @@ use rand::RngExt;
 use skein_inference::{Network, Scratch};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{
-    AlgorithmName, DecoderName, EncoderTraining, Observation, TeacherName,
+    AlgorithmName, DecoderName, EncoderTraining, Engine, Observation, TeacherName,
 };
 use skein_protocol::transition::Outcome;
 
@@ -546,6 +546,44 @@ fn a_trained_encoder_flies_from_the_first_episode_on_and_nothing_keeps_images() 
 
     config.learning.mirror = false;
     assert_eq!(Trainer::new(&config).unwrap().keep(), KeptData::Latents);
+}
+
+#[test]
+fn every_algorithm_that_can_starts_from_the_policy_of_a_snapshot() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("policy.safetensors");
+    let mut config = config();
+    (config.vae.train_steps, config.vae.start_from) = (0, Some(path.clone()));
+    config.learning.average_updates = 10;
+    config.replay.capacity = 1000;
+    let layout = SnapshotLayout::of(&config);
+    let begun = Snapshot {
+        version: PolicyVersion(7),
+        values: (0..layout.values())
+            .map(|place| 0.01 * (place as f32).cos())
+            .collect(),
+    };
+    std::fs::write(&path, begun.to_file(&layout, &config)).unwrap();
+    let random = Trainer::new(&config).unwrap().snapshot(PolicyVersion(0));
+    assert_ne!(random.values, begun.values);
+    config.learning.start_from = Some(path);
+    let mut distill = config.clone();
+    distill.learning.algorithm = AlgorithmName::Distill;
+    distill.distill.hidden_width = config.sac.hidden_width;
+    let mut libtorch = config.clone();
+    libtorch.run.engine = Some(Engine::Libtorch);
+    for config in [&config, &distill, &libtorch] {
+        let first = Trainer::new(config).unwrap().snapshot(PolicyVersion(0));
+        assert!(
+            first.values == begun.values,
+            "{:?}",
+            config.learning.algorithm
+        );
+    }
+    // A policy that does not fit is refused.
+    config.learning.history_steps = vec![1];
+    let error = Trainer::new(&config).unwrap_err().to_string();
+    assert!(error.contains("learning.start_from"), "{error}");
 }
 
 #[test]

@@ -317,7 +317,7 @@ impl NativeVae {
             let (isa, count) = (self.isa, images.len() / IMAGE_PIXELS);
             let (network, parameters, batch) =
                 (&mut self.network, &*self.parameters, &mut self.batch);
-            batch.resize(network, count);
+            batch.resize(network, count, count);
             let finish = skein_kernels::Finish::Rectified;
             network.linear.forward(
                 &mut self.team,

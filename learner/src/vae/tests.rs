@@ -409,3 +409,35 @@ fn a_supervised_vae_reproduces_the_clean_images() {
     assert!(after(Some(&images)) == own);
     assert!(after(Some(&clean)).0.pixel_error != own.0.pixel_error);
 }
+
+#[test]
+fn images_that_are_not_reproduced_change_nothing_but_what_the_second_head_and_divergence_ask() {
+    let images = synthetic_bytes(3, 2);
+    let after = |images: &[u8], reproduced: usize, kl_weight, known: f32| {
+        let section = VaeSection {
+            kl_weight,
+            ..with_latent(8)
+        };
+        let mut vae = NativeVae::supervised(&section, 1, 2, (2, 1.0));
+        let known = vec![known; 2 * images.len() / IMAGE_PIXELS];
+        let targets = Targets {
+            clean: Some(&images[..reproduced * IMAGE_PIXELS]),
+            geometry: &known,
+        };
+        let updated = vae.update_supervised(images, targets, &mut Noise::new(1));
+        let mut encoder = vec![0.0; vae.published_len()];
+        vae.publish(&mut encoder);
+        (updated.unwrap().0.pixel_error, bits(&encoder))
+    };
+    let first = &images[..IMAGE_PIXELS];
+    let alone = after(first, 1, 0.0, f32::NAN);
+    assert_eq!(after(&images, 1, 0.0, f32::NAN), alone);
+    assert_ne!(after(&images, 2, 0.0, f32::NAN), alone);
+    // The others count there.
+    for (kl_weight, known) in [(1.0, f32::NAN), (0.0, 0.5)] {
+        let alone = after(first, 1, kl_weight, known);
+        let beside = after(&images, 1, kl_weight, known);
+        assert_eq!(beside.0, alone.0);
+        assert_ne!(beside.1, alone.1);
+    }
+}

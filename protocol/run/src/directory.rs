@@ -8,7 +8,7 @@ use serde::Deserialize;
 
 use crate::{RunIdentity, durable, inputs};
 use skein_protocol::PROTOCOL_VERSION;
-use skein_protocol::config::{Config, ConfigError};
+use skein_protocol::config::{Config, ConfigError, ParameterKey};
 use skein_protocol::files::{self, REPORT_BYTES, SETTINGS_BYTES};
 use skein_protocol::ids::ActorId;
 
@@ -30,6 +30,11 @@ impl RunDirectory {
         Self { root: root.into() }
     }
 
+    /// Returns the copy of the file that `key` names, if the configuration has the key.
+    pub fn parameters(&self, key: ParameterKey) -> PathBuf {
+        self.root.join(key.copy())
+    }
+
     /// Returns the directory itself.
     pub fn root(&self) -> &Path {
         &self.root
@@ -42,8 +47,6 @@ impl RunDirectory {
         identity => "run.json",
         /// Copies of the course files, so that the directory is complete.
         courses => "courses",
-        /// Copy of the encoder that the run starts from, where `vae.start_from` names one.
-        encoder => "encoder.safetensors",
         /// Log files, one per process.
         logs => "logs",
         /// Lock file that the learner holds while it is alive, see
@@ -133,15 +136,17 @@ impl RunDirectory {
         // identity.
         let resolved = self.write_config(config)?;
         let courses = inputs::course_checksums(&self.courses()).map_err(io(self.courses()))?;
-        let encoder = inputs::encoder_checksum(&self.encoder()).map_err(io(self.encoder()))?;
+        let parameters =
+            inputs::parameter_checksums(&self.root, config).map_err(io(self.root.clone()))?;
         let copies = courses.keys().map(|name| self.courses().join(name));
-        for file in copies.chain(encoder.is_some().then(|| self.encoder())) {
+        let parameter_copies = parameters.keys().map(|name| self.root.join(name));
+        for file in copies.chain(parameter_copies) {
             durable::sync(&file).map_err(io(file))?;
         }
         if !courses.is_empty() {
             durable::sync(&self.courses()).map_err(io(self.courses()))?;
         }
-        let identity = RunIdentity::new(&resolved, courses, encoder);
+        let identity = RunIdentity::new(&resolved, courses, parameters);
         self.write_identity(&identity)?;
         Ok(identity)
     }
@@ -236,8 +241,8 @@ impl RunDirectory {
         for course in config.courses.paths_mut() {
             *course = Path::new("courses").join(course.file_name().unwrap_or_default());
         }
-        if let Some(encoder) = &mut config.vae.start_from {
-            *encoder = encoder.file_name().map(PathBuf::from).unwrap_or_default();
+        for (_, file) in config.parameter_files_mut() {
+            *file = file.file_name().map(PathBuf::from).unwrap_or_default();
         }
         identity.config_digest = self.write_config(&config)?.digest();
         self.write_identity(&identity)?;
@@ -276,7 +281,7 @@ impl RunDirectory {
             });
         }
         inputs::verify_courses(&self.courses(), &identity.courses, &config)?;
-        inputs::verify_encoder(&self.encoder(), identity.encoder.as_deref(), &config)?;
+        inputs::verify_parameters(&self.root, &identity.parameters, &config)?;
         Ok((identity, config))
     }
 }
@@ -400,10 +405,10 @@ pub enum RunError {
         /// The problem.
         problem: String,
     },
-    /// The encoder's file is not the one the run was started with.
-    #[error("{} {problem}: the run would mix the codes of different encoders; restore the file, or \
-        start a new run", path.display())]
-    EncoderChanged {
+    /// A file of parameters is not the one the run was started with.
+    #[error("{} {problem}: the run would mix episodes of different encoders or policies; restore \
+        the file, or start a new run", path.display())]
+    ParametersChanged {
         /// The file.
         path: PathBuf,
         /// The problem.
@@ -577,21 +582,27 @@ mod tests {
     fn a_changed_or_missing_encoder_is_refused_by_name() {
         let directory = tempfile::tempdir().unwrap();
         let run = RunDirectory::new(directory.path());
-        fs::write(run.encoder(), "parameters").unwrap();
+        fs::write(run.parameters(ParameterKey::Encoder), "parameters").unwrap();
         run.create(&started_from_encoder()).unwrap();
         let (_, config) = run.open().unwrap();
-        assert_eq!(config.vae.start_from, Some(run.encoder()));
+        assert_eq!(
+            config.vae.start_from,
+            Some(run.parameters(ParameterKey::Encoder))
+        );
         let refused = |problem: &str| {
             let error = run.open().unwrap_err().to_string();
-            for part in [run.encoder().to_str().unwrap(), problem] {
+            for part in [
+                run.parameters(ParameterKey::Encoder).to_str().unwrap(),
+                problem,
+            ] {
                 assert!(error.contains(part), "{error}");
             }
         };
-        fs::write(run.encoder(), "others").unwrap();
+        fs::write(run.parameters(ParameterKey::Encoder), "others").unwrap();
         refused("has changed");
-        fs::remove_file(run.encoder()).unwrap();
+        fs::remove_file(run.parameters(ParameterKey::Encoder)).unwrap();
         refused("No such file");
-        fs::write(run.encoder(), "parameters").unwrap();
+        fs::write(run.parameters(ParameterKey::Encoder), "parameters").unwrap();
         run.open().unwrap();
 
         // The digest ignores folders, but an encoder elsewhere is still another encoder.
@@ -610,15 +621,18 @@ mod tests {
         );
         let run = RunDirectory::new(&before);
         fs::create_dir(&before).unwrap();
-        fs::write(run.encoder(), "parameters").unwrap();
+        fs::write(run.parameters(ParameterKey::Encoder), "parameters").unwrap();
         let begun = run.create(&started_from_encoder()).unwrap();
         fs::rename(&before, &after).unwrap();
         let run = RunDirectory::new(&after);
         let (_, moved) = run.open().unwrap();
         assert_eq!(moved.courses.training, after.join("courses/training.toml"));
-        assert_eq!(moved.vae.start_from, Some(run.encoder()));
+        assert_eq!(
+            moved.vae.start_from,
+            Some(run.parameters(ParameterKey::Encoder))
+        );
         let (identity, _) = run.lengthen(moved.run.episodes + 1).unwrap();
-        assert_eq!(identity.encoder, begun.encoder);
+        assert_eq!(identity.parameters, begun.parameters);
     }
 
     #[test]

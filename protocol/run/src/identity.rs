@@ -36,10 +36,10 @@ pub struct RunIdentity {
     /// Checksum (xxh3, hexadecimal) of each file in [`courses`](super::RunDirectory::courses) at
     /// the start of the run, by file name.
     pub courses: BTreeMap<String, String>,
-    /// Checksum of [`encoder`](super::RunDirectory::encoder) at the start of the run, likewise;
-    /// `None` where the run trains its own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub encoder: Option<String>,
+    /// Checksum of each file of [`parameters`](super::RunDirectory::parameters) at the start of the
+    /// run, likewise.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub parameters: BTreeMap<String, String>,
 }
 
 /// Number of a learner start, counted since the first of the run's living processes started. It is
@@ -77,7 +77,7 @@ impl RunIdentity {
     pub(super) fn new(
         config: &Config,
         courses: BTreeMap<String, String>,
-        encoder: Option<String>,
+        parameters: BTreeMap<String, String>,
     ) -> Self {
         let nanos = SystemTime::now()
             .duration_since(UNIX_EPOCH)
@@ -87,7 +87,7 @@ impl RunIdentity {
             run: RunId(nanos ^ u64::from(std::process::id()).rotate_left(48)),
             config_digest: config.digest(),
             courses,
-            encoder,
+            parameters,
         }
     }
 
@@ -287,7 +287,7 @@ mod tests {
         // folder/prefix<number of a port>.event, ended by a zero byte; the number has up to 39
         // digits.
         const ROOM: usize = 108 - 1 - "/".len() - ".event".len() - 39;
-        let identity = RunIdentity::new(&Config::default(), BTreeMap::new(), None);
+        let identity = RunIdentity::new(&Config::default(), BTreeMap::new(), BTreeMap::new());
         let incarnation = LearnerIncarnation(9999);
         assert!(
             identity.incarnation_folder(incarnation).as_os_str().len()
@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn a_process_that_does_not_match_is_refused_with_what_differs() {
         let config = Config::default();
-        let identity = RunIdentity::new(&config, BTreeMap::new(), None);
+        let identity = RunIdentity::new(&config, BTreeMap::new(), BTreeMap::new());
         let announcement = Announcement::new(&identity, LearnerIncarnation::after(None), &config);
         assert_eq!(announcement.check(&identity, &config), Ok(()));
         let refusal = |identity: &RunIdentity, config: &Config| {

@@ -1,5 +1,5 @@
-//! Checksums of the copied course files and encoder: a run flies exactly the courses, with exactly
-//! the encoder, that it was started with.
+//! Checksums of the copied files of courses and parameters: a run flies exactly the courses, with
+//! exactly the encoder and the policies, that it was started with.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -64,37 +64,47 @@ pub(super) fn verify_courses(
     Ok(())
 }
 
-/// Returns the checksum of the encoder at `path`; `None` if there is none.
-pub(super) fn encoder_checksum(path: &Path) -> io::Result<Option<String>> {
-    match checksum(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-        checksum => checksum.map(Some),
+/// Returns the checksum of each copy of a file of parameters that `config` names and that is in
+/// `root`, by the copy's name.
+pub(super) fn parameter_checksums(
+    root: &Path,
+    config: &Config,
+) -> io::Result<BTreeMap<String, String>> {
+    let mut checksums = BTreeMap::new();
+    for (key, _) in config.parameter_files() {
+        match checksum(&root.join(key.copy())) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            found => drop(checksums.insert(key.copy().to_owned(), found?)),
+        }
     }
+    Ok(checksums)
 }
 
-/// Checks that the run starts from the encoder at `path`, and that it matches `expected`.
-pub(super) fn verify_encoder(
-    path: &Path,
-    expected: Option<&str>,
+/// Checks that the run uses the copies in `root`, and that they match `checksums`.
+pub(super) fn verify_parameters(
+    root: &Path,
+    checksums: &BTreeMap<String, String>,
     config: &Config,
 ) -> Result<(), RunError> {
-    // A run created without a copy has no checksum.
-    let (Some(expected), Some(used)) = (expected, &config.vae.start_from) else {
-        return Ok(());
-    };
-    let problem = match used == path {
-        true => change(path, expected),
-        false => Some(format!(
-            "is not what vae.start_from names, which is {}",
-            used.display()
-        )),
-    };
-    problem.map_or(Ok(()), |problem| {
-        Err(RunError::EncoderChanged {
-            path: path.to_owned(),
-            problem,
-        })
-    })
+    for (key, used) in config.parameter_files() {
+        // A run created without a copy has no checksum.
+        let Some(expected) = checksums.get(key.copy()) else {
+            continue;
+        };
+        let path = root.join(key.copy());
+        let problem = match *used == path {
+            true => change(&path, expected),
+            false => Some(format!(
+                "is not what {} names, which is {}",
+                key.name(),
+                used.display()
+            )),
+        };
+        if let Some(problem) = problem {
+            return Err(RunError::ParametersChanged { path, problem });
+        }
+    }
+    Ok(())
 }
 
 /// Returns the difference between the file at `path` and the one whose checksum is `expected`.

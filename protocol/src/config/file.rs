@@ -79,8 +79,8 @@ pub enum ConfigError {
 }
 
 /// Returns the override that causes the failure of `attempt` with all of `overrides`: the first
-/// that makes the attempt fail with exactly this message. Returns `None` when the file alone fails
-/// this way.
+/// that makes the attempt fail with this message, whatever numbers it names. Returns `None` when
+/// the file alone fails with exactly this message.
 ///
 /// `attempt` receives the first overrides, from none to all; it returns the error message, or
 /// `None` when it succeeds.
@@ -88,11 +88,20 @@ pub fn failing_override(
     overrides: &[String],
     attempt: impl Fn(&[String]) -> Option<String>,
 ) -> Option<&String> {
-    let failure = attempt(overrides);
-    (0..overrides.len())
-        .rev()
-        .find(|&count| attempt(&overrides[..count]) != failure)
-        .map(|count| &overrides[count])
+    let messages: Vec<_> = (0..=overrides.len())
+        .map(|count| attempt(&overrides[..count]))
+        .collect();
+    // A later override may change the numbers of a failure that it does not cause.
+    let unnumbered = |message: &Option<String>| {
+        let message = message.as_ref()?;
+        Some(message.replace(|character: char| character.is_ascii_digit(), ""))
+    };
+    let unnumbered: Vec<_> = messages.iter().map(unnumbered).collect();
+    [unnumbered, messages].iter().find_map(|messages| {
+        let (failure, before) = messages.split_last()?;
+        let cause = before.iter().rposition(|message| message != failure)?;
+        overrides.get(cause)
+    })
 }
 
 /// Environment variable that names the folder of the shipped configurations, whose `courses/` holds
@@ -187,8 +196,8 @@ impl Config {
         for course in &mut config.courses.evaluation {
             *course = evaluation.join(&*course);
         }
-        if let Some(encoder) = &mut config.vae.start_from {
-            *encoder = directory.join(&*encoder);
+        for (_, path) in config.parameter_files_mut() {
+            *path = directory.join(&*path);
         }
         for file in config.files() {
             if file.to_str().is_none() {
@@ -214,6 +223,9 @@ impl Config {
         let mut changed = Self::parse_with(&self.to_toml(), path, overrides, None)?;
         changed.courses.clone_from(&self.courses);
         changed.vae.start_from.clone_from(&self.vae.start_from);
+        changed.teacher.snapshot.clone_from(&self.teacher.snapshot);
+        let start_from = &mut changed.learning.start_from;
+        start_from.clone_from(&self.learning.start_from);
         Ok(changed)
     }
 
@@ -324,7 +336,13 @@ fn apply_override(table: &mut Table, text: &str) -> Result<(), ConfigError> {
 }
 
 /// Keys that name files.
-pub const FILE_KEYS: [&str; 3] = ["courses.training", "courses.evaluation", "vae.start_from"];
+pub const FILE_KEYS: [&str; 5] = [
+    "courses.training",
+    "courses.evaluation",
+    "vae.start_from",
+    "teacher.snapshot",
+    "learning.start_from",
+];
 
 /// Makes paths absolute: paths on the command line are relative to the working directory, not to
 /// the configuration file. Other values are left for validation to refuse.

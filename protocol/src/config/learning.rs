@@ -1,6 +1,7 @@
 //! The `[learning]` section.
 
 use std::fmt;
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
@@ -20,6 +21,11 @@ pub struct LearningSection {
     /// Learning algorithm: `sac`, `td3` or `distill`, each with a section of its own. `distill`
     /// needs a `[teacher]`. Default `sac`, as in the paper.
     pub algorithm: AlgorithmName,
+    /// Snapshot whose policy `sac` or `distill` starts from, instead of a random one. The policy
+    /// must see what this run's policy sees, by the same encoder: name the same file in
+    /// `vae.start_from`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub start_from: Option<PathBuf>,
     /// Training of the encoder, which turns a depth image into the policy's input. `vae` trains it
     /// as a variational auto-encoder. `end-to-end` trains it by the critic's loss; then `[vae]`
     /// sets only the code's length, and every transition keeps its images, 9 KiB each. Default
@@ -70,6 +76,7 @@ impl Default for LearningSection {
     fn default() -> Self {
         Self {
             algorithm: AlgorithmName::Sac,
+            start_from: None,
             encoder: EncoderTraining::Vae,
             episodes_per_epoch: 10,
             segment_steps: 0,

@@ -76,6 +76,37 @@ pub struct Config {
     pub simulator: toml::Table,
 }
 
+/// A key that names a file of parameters, which a run copies into its directory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ParameterKey {
+    /// `vae.start_from`.
+    Encoder,
+    /// `teacher.snapshot`.
+    Teacher,
+    /// `learning.start_from`.
+    Policy,
+}
+
+impl ParameterKey {
+    /// Returns the key as it stands in a configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Encoder => "vae.start_from",
+            Self::Teacher => "teacher.snapshot",
+            Self::Policy => "learning.start_from",
+        }
+    }
+
+    /// Returns the name of the copy in a run's directory.
+    pub fn copy(self) -> &'static str {
+        match self {
+            Self::Encoder => "encoder.safetensors",
+            Self::Teacher => "teacher.safetensors",
+            Self::Policy => "policy.safetensors",
+        }
+    }
+}
+
 impl Config {
     /// Returns the number of transitions in a minibatch of the configured algorithm.
     pub fn batch_size(&self) -> usize {
@@ -92,12 +123,47 @@ impl Config {
 
     /// Returns every file that the configuration names.
     pub fn files(&self) -> impl Iterator<Item = &PathBuf> {
-        self.courses.paths().chain(&self.vae.start_from)
+        let parameters = self.parameter_files().map(|(_, path)| path);
+        self.courses.paths().chain(parameters)
+    }
+
+    /// Returns the files of parameters that the configuration names, each with its key.
+    pub fn parameter_files(&self) -> impl Iterator<Item = (ParameterKey, &PathBuf)> {
+        [
+            (ParameterKey::Encoder, &self.vae.start_from),
+            (ParameterKey::Teacher, &self.teacher.snapshot),
+            (ParameterKey::Policy, &self.learning.start_from),
+        ]
+        .into_iter()
+        .filter_map(|(key, path)| path.as_ref().map(|path| (key, path)))
     }
 
     /// Returns every file that the configuration names, mutable.
     pub fn files_mut(&mut self) -> impl Iterator<Item = &mut PathBuf> {
-        self.courses.paths_mut().chain(&mut self.vae.start_from)
+        let Self {
+            courses,
+            vae,
+            teacher,
+            learning,
+            ..
+        } = self;
+        let parameters = [
+            &mut vae.start_from,
+            &mut teacher.snapshot,
+            &mut learning.start_from,
+        ];
+        courses.paths_mut().chain(parameters.into_iter().flatten())
+    }
+
+    /// As [`Config::parameter_files`], with paths that can be changed.
+    pub fn parameter_files_mut(&mut self) -> impl Iterator<Item = (ParameterKey, &mut PathBuf)> {
+        [
+            (ParameterKey::Encoder, &mut self.vae.start_from),
+            (ParameterKey::Teacher, &mut self.teacher.snapshot),
+            (ParameterKey::Policy, &mut self.learning.start_from),
+        ]
+        .into_iter()
+        .filter_map(|(key, path)| path.as_mut().map(|path| (key, path)))
     }
 
     /// Returns the layout of the policy's observation.
@@ -158,6 +224,7 @@ impl Config {
         self.validate_segments()?;
         self.validate_encoder()?;
         self.validate_teacher()?;
+        self.validate_start()?;
         let (key, batch_size) = self.batch_size_by_key();
         require(
             batch_size <= self.learning.warmup_steps.max(1),
@@ -232,7 +299,7 @@ impl Config {
         require(
             !taught || algorithm != AlgorithmName::Td3,
             "teacher.policy",
-            "oracle",
+            self.teacher.policy,
             "does not go with learning.algorithm = \"td3\", which learns from rewards alone: set \
             it to \"none\"",
         )?;
@@ -249,6 +316,31 @@ impl Config {
             self.learning.segment_steps,
             "does not go with a teacher, who follows whole episodes: set it to 0, or \
             teacher.policy to \"none\"",
+        )
+    }
+
+    /// Checks what `learning.start_from` requires of other keys.
+    fn validate_start(&self) -> Result<(), InvalidValue> {
+        let Some(file) = &self.learning.start_from else {
+            return Ok(());
+        };
+        let (key, value) = (
+            ParameterKey::Policy.name(),
+            format!("\"{}\"", file.display()),
+        );
+        require(
+            self.learning.algorithm != AlgorithmName::Td3,
+            key,
+            &value,
+            "does not go with learning.algorithm = \"td3\", which starts from random parameters: \
+            leave it out",
+        )?;
+        require(
+            self.vae.start_from.is_some(),
+            key,
+            &value,
+            "needs the encoder that the policy was trained with: name the same file in \
+            vae.start_from, and set vae.train_steps to 0",
         )
     }
 

@@ -1,5 +1,8 @@
 //! The `[teacher]` section.
 
+use std::fmt;
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 use super::{InvalidValue, require};
@@ -12,9 +15,12 @@ use super::{InvalidValue, require};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TeacherSection {
-    /// Expert: `none`, or `oracle`, which knows the next opening and the drone's motion. Default
-    /// `none`.
+    /// Expert: `none`; `oracle`, which knows the next opening and the drone's motion; or
+    /// `snapshot`, a trained policy that sees what the drone sees. Default `none`.
     pub policy: TeacherName,
+    /// File of the policy, with `policy = "snapshot"`: any snapshot of this version.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub snapshot: Option<PathBuf>,
     /// Share of the first training steps that the teacher flies, 0 to 1. It falls linearly to 0.
     /// Default 0.
     pub flown_share: f64,
@@ -32,6 +38,7 @@ impl Default for TeacherSection {
     fn default() -> Self {
         Self {
             policy: TeacherName::None,
+            snapshot: None,
             flown_share: 0.0,
             flown_steps: 0,
             loss_weight: 5.0,
@@ -55,7 +62,9 @@ impl TeacherSection {
     pub fn loss_weight_after(&self, updates: u64) -> f64 {
         match self.policy {
             TeacherName::None => 0.0,
-            TeacherName::Oracle => self.loss_weight * remaining(updates, self.loss_updates),
+            TeacherName::Oracle | TeacherName::Snapshot => {
+                self.loss_weight * remaining(updates, self.loss_updates)
+            }
         }
     }
 
@@ -73,6 +82,21 @@ impl TeacherSection {
             "is above 0, but teacher.policy = \"none\": nobody would fly these steps; set it to \
             0, or teacher.policy to \"oracle\"",
         )?;
+        let is_snapshot = self.policy == TeacherName::Snapshot;
+        require(
+            !is_snapshot || self.snapshot.is_some(),
+            "teacher.policy",
+            "snapshot",
+            "asks for a policy's file: name it in teacher.snapshot",
+        )?;
+        if let Some(file) = &self.snapshot {
+            require(
+                is_snapshot,
+                "teacher.snapshot",
+                format!("\"{}\"", file.display()),
+                "is asked nothing: set teacher.policy to \"snapshot\", or leave it out",
+            )?;
+        }
         require(
             (0.0..=1000.0).contains(&self.loss_weight),
             "teacher.loss_weight",
@@ -99,6 +123,18 @@ pub enum TeacherName {
     None,
     /// The scripted expert of the simulator.
     Oracle,
+    /// The policy of a snapshot's file.
+    Snapshot,
+}
+
+impl fmt::Display for TeacherName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::None => "none",
+            Self::Oracle => "oracle",
+            Self::Snapshot => "snapshot",
+        })
+    }
 }
 
 #[cfg(test)]
@@ -109,6 +145,7 @@ mod tests {
     fn share_and_weight_fall_linearly_to_zero() {
         let teacher = TeacherSection {
             policy: TeacherName::Oracle,
+            snapshot: None,
             flown_share: 0.5,
             flown_steps: 100,
             loss_weight: 4.0,

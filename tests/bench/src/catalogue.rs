@@ -55,6 +55,8 @@ pub enum RunCondition {
     Always,
     /// It runs if pictures of growth are requested.
     Growth,
+    /// It runs if `--only` names it.
+    Named,
 }
 
 /// BenchmarkRow of the table.

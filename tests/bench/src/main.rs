@@ -8,7 +8,9 @@ use std::process::ExitCode;
 use anyhow::{Context, Result, bail};
 use clap::{Parser, Subcommand};
 use serde::Serialize;
-use skein_bench::catalogue::{BenchKind, BenchmarkRow, Catalogue, Growth, RunCondition, bench_of};
+use skein_bench::catalogue::{
+    Bench, BenchKind, BenchmarkRow, Catalogue, Growth, RunCondition, bench_of,
+};
 use skein_bench::faults::faults;
 use skein_bench::figures::BenchmarkFigures;
 use skein_bench::machine::{Core, Machine};
@@ -113,7 +115,7 @@ fn list(only: &[String], when: RunCondition) -> Result<()> {
     }
     for bench in benches {
         let wanted = match only {
-            [] => bench.when == RunCondition::Always || when == RunCondition::Growth,
+            [] => bench.when == RunCondition::Always || bench.when == when,
             only => only.contains(&bench.name),
         };
         if wanted {
@@ -138,8 +140,20 @@ fn tabulate(
     judging: Judging,
     pictures: Option<&Path>,
 ) -> Result<()> {
-    let wanted = |figure: &str| only.is_empty() || only.iter().any(|name| name == bench_of(figure));
-    let Catalogue { rows, growths, .. } = Catalogue::load();
+    let Catalogue {
+        benches,
+        rows,
+        growths,
+    } = Catalogue::load();
+    let is_named = |bench: &&Bench| bench.when == RunCondition::Named;
+    let named: Vec<_> = benches.iter().filter(is_named).collect();
+    let wanted = |figure: &str| {
+        let of = bench_of(figure);
+        match only {
+            [] => named.iter().all(|bench| bench.name != of),
+            only => only.iter().any(|name| name == of),
+        }
+    };
     let figures = BenchmarkFigures::read(directory)?;
     if figures.is_empty() {
         bail!(

@@ -142,6 +142,54 @@ fn a_ticket_flown_again_is_the_same_episode_bit_for_bit() {
 }
 
 #[test]
+fn a_snapshot_teaches_by_what_its_own_encoder_and_history_see() {
+    let layout = ObservationLayout {
+        per_step: Observation::LatentVelocityAction,
+        latent: 8,
+        history_steps: vec![2],
+    };
+    let snapshot_layout = SnapshotLayout::new(&layout, 16);
+    let snapshot = random_snapshot(&snapshot_layout, 9);
+    let teacher = || Network::new(&snapshot, &snapshot_layout);
+    let taught = |seed| {
+        let ticket = Ticket {
+            teacher_share: Some(0.3),
+            ..ticket(Exploration::Sample, seed)
+        };
+        let mut taught = environment_loop("").with_teacher(teacher(), Agent::new(layout.clone()));
+        flown(&mut taught, &ticket).1.sent
+    };
+    let sent = taught(1);
+    let steps = sent.len() - 1;
+    assert!(steps > 3, "too short to have a history");
+    for (step, record) in sent[..steps].iter().enumerate() {
+        let mut observed = Vec::new();
+        for seen_step in [step, step.max(2) - 2] {
+            let seen = &sent[seen_step];
+            observed.extend(&teacher().encode(&seen.depth, &mut Scratch::default())[..8]);
+            observed.extend(&seen.velocity_mps[1..]);
+            observed.extend(match seen_step {
+                0 => [0.0; 2],
+                _ => sent[seen_step - 1].action,
+            });
+        }
+        let expected = teacher().distribution(&observed, &mut Scratch::default());
+        assert_eq!(record.teacher_action, expected.mode(), "step {step}");
+    }
+    // An actor that flew something else before teaches the same.
+    let mut used = environment_loop("").with_teacher(teacher(), Agent::new(layout.clone()));
+    let mut fly = |seed| {
+        let ticket = Ticket {
+            teacher_share: Some(0.3),
+            ..ticket(Exploration::Sample, seed)
+        };
+        flown(&mut used, &ticket).1.sent
+    };
+    fly(1);
+    assert_eq!(raw(&fly(2)), raw(&taught(2)));
+}
+
+#[test]
 fn exploration_does_not_change_the_start() {
     let start = |exploration| {
         flown(&mut environment_loop(""), &ticket(exploration, 1))

@@ -164,7 +164,10 @@ fn the_example_in_the_documents_can_run() {
         .find(|part| part.starts_with("question = "))
         .unwrap();
     let (example, _) = example.split_once("```").unwrap();
-    let text = example.replace("../local.toml", shipped("local.toml").to_str().unwrap());
+    let text = example.replace(
+        "../one-course.toml",
+        shipped("one-course.toml").to_str().unwrap(),
+    );
     let experiment = load(&text, None).unwrap();
     assert_eq!(
         (experiment.seeds, experiment.arms[1].config.sac.batch_size),

@@ -8,21 +8,22 @@ use super::parameter_order::LayerRanges;
 use super::unfold;
 
 /// Activations, and the gradients of the loss with respect to them, image by image, channels last.
-/// Reused from step to step. All shapes are per batch of n images.
+/// Reused from step to step. All shapes are per batch of n images, of which the first m are decoded
+/// again.
 #[derive(Debug, Default)]
 pub(super) struct BatchBuffers {
     /// Pixels, then the outputs of the encoder's four convolutions after ReLU,
     /// `[n, pixels, channels]` each.
     pub(super) encoder_maps: [Buffer; 5],
-    /// Pixels to reproduce where they are not the input's, `[n, 72, 128]`.
+    /// Pixels to reproduce where they are not the input's, `[m, 72, 128]`.
     pub(super) clean: Buffer,
     /// Mean and log-variance of the latent code, `[n, 2 latent]`.
     pub(super) heads: Buffer,
     /// Sampled latent codes, `[n, latent]`.
     pub(super) codes: Buffer,
-    /// The decoder's first feature map, `[n, 3, 1024]`, after ReLU.
+    /// The decoder's first feature map, `[m, 3, 1024]`, after ReLU.
     pub(super) unfolded: Buffer,
-    /// Outputs of the decoder's four transposed convolutions, `[n, pixels, channels]` each, after
+    /// Outputs of the decoder's four transposed convolutions, `[m, pixels, channels]` each, after
     /// ReLU. The last one holds the gradient before its sigmoid after the backward pass.
     pub(super) decoder_maps: [Buffer; 4],
     /// Gradients before ReLU of the encoder's outputs, shaped like them; pixels need none.
@@ -31,7 +32,7 @@ pub(super) struct BatchBuffers {
     pub(super) heads_grad: Buffer,
     /// Gradient with respect to `codes`, `[n, latent]`.
     pub(super) codes_grad: Buffer,
-    /// Gradient before ReLU of `unfolded`, `[n, 3, 1024]`.
+    /// Gradient before ReLU of `unfolded`, `[m, 3, 1024]`.
     pub(super) unfolded_grad: Buffer,
     /// Gradients before ReLU of the decoder's outputs, except the last one's.
     pub(super) decoder_maps_grad: [Buffer; 3],
@@ -39,46 +40,59 @@ pub(super) struct BatchBuffers {
     /// `[n, biases]`.
     pub(super) encoder_bias_sums: Buffer,
     /// Gradient with respect to each bias of the decoder's convolutions, image by image,
-    /// `[n, biases]`.
+    /// `[m, biases]`.
     pub(super) decoder_bias_sums: Buffer,
-    /// Squared error of each image, `[n]`.
+    /// Squared error of each decoded image, `[m]`.
     pub(super) errors: Vec<f64>,
 }
 
 impl BatchBuffers {
-    /// Makes room for `images` images.
-    pub(super) fn resize(&mut self, network: &VaeNetwork, images: usize) {
+    /// Makes room for `images` images, the first `decoded` of which are decoded again.
+    pub(super) fn resize(&mut self, network: &VaeNetwork, images: usize, decoded: usize) {
         let latent = network.latent();
-        let (encoder, decoder) = (network.encoder_lens(), network.decoder_lens());
-        let resize = |buffers: &mut [Buffer], lens: &[usize]| {
-            for (buffer, len) in buffers.iter_mut().zip(lens) {
-                buffer.resize(images * len);
-            }
-        };
-        resize(&mut self.encoder_maps, &encoder);
-        resize(&mut self.encoder_maps_grad, &encoder[1..]);
-        resize(&mut self.decoder_maps, &decoder);
-        resize(&mut self.decoder_maps_grad, &decoder[..3]);
-        for (buffer, len) in [
-            (&mut self.clean, IMAGE_PIXELS),
+        let encoder_lens = network.encoder_lens();
+        let encoder = [
             (&mut self.heads, 2 * latent),
             (&mut self.heads_grad, 2 * latent),
             (&mut self.codes, latent),
             (&mut self.codes_grad, latent),
-            (&mut self.unfolded, unfold::INPUT_LEN),
-            (&mut self.unfolded_grad, unfold::INPUT_LEN),
             (
                 &mut self.encoder_bias_sums,
                 sums_len(network.encoder_places()),
             ),
+        ]
+        .into_iter()
+        .chain(self.encoder_maps.iter_mut().zip(encoder_lens))
+        .chain(
+            self.encoder_maps_grad
+                .iter_mut()
+                .zip(encoder_lens.into_iter().skip(1)),
+        );
+        for (buffer, len) in encoder {
+            buffer.resize(images * len);
+        }
+        let decoder_lens = network.decoder_lens();
+        let decoder = [
+            (&mut self.clean, IMAGE_PIXELS),
+            (&mut self.unfolded, unfold::INPUT_LEN),
+            (&mut self.unfolded_grad, unfold::INPUT_LEN),
             (
                 &mut self.decoder_bias_sums,
                 sums_len(network.decoder_places()),
             ),
-        ] {
-            buffer.resize(images * len);
+        ]
+        .into_iter()
+        .chain(self.decoder_maps.iter_mut().zip(decoder_lens))
+        .chain(self.decoder_maps_grad.iter_mut().zip(decoder_lens));
+        for (buffer, len) in decoder {
+            buffer.resize(decoded * len);
         }
-        self.errors.resize(images, 0.0);
+        self.errors.resize(decoded, 0.0);
+    }
+
+    /// Returns the length of the codes that are decoded, `[m, latent]`.
+    pub(super) fn decoded_len(&self, latent: usize) -> usize {
+        self.errors.len() * latent
     }
 }
 

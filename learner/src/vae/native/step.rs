@@ -22,7 +22,8 @@ use super::stopwatch::Pass;
 /// Knowledge about a minibatch, beyond its images.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Targets<'a> {
-    /// Images to reproduce, `[n, 72, 128]`; `None` for the images themselves.
+    /// Images to reproduce from the first m codes, `[m, 72, 128]`; `None` for all images
+    /// themselves. The decoder is most of a step's work.
     pub clean: Option<&'a [u8]>,
     /// Numbers to regress, `[n, outputs]`, NaN where one is unknown; empty for none.
     pub geometry: &'a [f32],
@@ -68,7 +69,10 @@ impl StepContext<'_> {
         gradient: &mut [f32],
     ) -> LossParts {
         let count = depth.len() / IMAGE_PIXELS;
-        self.batch.resize(self.network, count);
+        let decoded = targets
+            .clean
+            .map_or(count, |clean| clean.len() / IMAGE_PIXELS);
+        self.batch.resize(self.network, count, decoded);
         if let Some(clean) = targets.clean {
             scale(self.isa, clean, &mut self.batch.clean);
         }
@@ -78,13 +82,13 @@ impl StepContext<'_> {
             None => Reproduced::Input,
             Some(_) => Reproduced::Clean,
         };
-        self.decode_and_backward(towards, count);
+        self.decode_and_backward(towards, decoded);
         self.unfold_backward();
         let geometry = self.code_backward(targets.geometry, noise, self.kl_weight / count as f64);
         self.encoder_backward(count);
         self.gradients(gradient);
 
-        let error = self.batch.errors.iter().sum::<f64>() / count as f64;
+        let error = self.batch.errors.iter().sum::<f64>() / decoded as f64;
         LossParts {
             loss: (error + self.kl_weight * divergence + geometry) as f32,
             error: error as f32,
@@ -141,7 +145,7 @@ impl StepContext<'_> {
         network.linear.forward(
             self.team,
             parameters,
-            &batch.codes,
+            &batch.codes[..batch.decoded_len(network.latent())],
             Finish::Rectified,
             &mut batch.unfolded,
         );
@@ -152,7 +156,7 @@ impl StepContext<'_> {
     }
 
     /// Forward through the rest of the decoder, squared error, and backward to its first feature
-    /// map.
+    /// map. `count`: number of images decoded.
     fn decode_and_backward(&mut self, towards: Reproduced, count: usize) {
         let (isa, network, parameters) = (self.isa, &*self.network, self.parameters);
         let BatchBuffers {
@@ -231,12 +235,12 @@ impl StepContext<'_> {
         let (network, batch) = (&*self.network, &mut *self.batch);
         let watch = &mut self.members[0].watch;
         watch.start();
-        network.linear.backward(
-            self.team,
-            &batch.unfolded_grad,
-            Finish::Plain,
-            &mut batch.codes_grad,
-        );
+        let decoded = batch.decoded_len(network.latent());
+        let (from_images, others) = batch.codes_grad.split_at_mut(decoded);
+        network
+            .linear
+            .backward(self.team, &batch.unfolded_grad, Finish::Plain, from_images);
+        others.fill(0.0);
         watch.layer(LINEAR, Pass::Backward);
         let geometry = match &mut self.geometry {
             Some(head) => head.add_gradient(self.team, &batch.codes, known, &mut batch.codes_grad),
@@ -347,9 +351,13 @@ impl StepContext<'_> {
             gradient,
         );
         watch.layer(HEADS, Pass::Gradient);
-        network
-            .linear
-            .gradient(self.team, isa, &batch.unfolded_grad, &batch.codes, gradient);
+        network.linear.gradient(
+            self.team,
+            isa,
+            &batch.unfolded_grad,
+            &batch.codes[..batch.decoded_len(network.latent())],
+            gradient,
+        );
         watch.layer(LINEAR, Pass::Gradient);
         total(
             isa,

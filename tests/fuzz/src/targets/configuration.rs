@@ -92,7 +92,7 @@ fn file() -> &'static Path {
 
 fn config_samples() -> Vec<Vec<u8>> {
     let mut samples = [
-        "configs/local.toml",
+        "configs/generalist.toml",
         "configs/smoke.toml",
         "configs/paper.toml",
         "tests/small.toml",
