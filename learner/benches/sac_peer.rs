@@ -42,7 +42,8 @@ fn main() {
         }
     }
     // XLA may be slower on two threads than on one.
-    print("jax", fastest[0].jax.min(fastest[1].jax));
+    print("jax/1", fastest[0].jax);
+    print("jax/best", fastest[0].jax.min(fastest[1].jax));
     for (threads, fastest) in (1..).zip(fastest) {
         print(&threads.to_string(), fastest.ours);
         let [ours, jax] = [fastest.ours, fastest.jax].map(|secs| secs * 1e3);
