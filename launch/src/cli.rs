@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
 use skein_run::failure::EXIT_WRONG_ARGUMENTS;
-use skein_run::note;
 use skein_run::terminal::quoted;
+use skein_run::{note, notes};
 
 /// Trains a drone to avoid obstacles from its depth camera.
 ///
@@ -231,6 +231,7 @@ impl RunArguments {
             },
             _ => {
                 note!("skein: {}", self.conflict());
+                notes::settle();
                 std::process::exit(EXIT_WRONG_ARGUMENTS.into())
             }
         }

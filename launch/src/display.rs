@@ -5,14 +5,16 @@
 //! results.
 
 use std::collections::VecDeque;
-use std::fmt;
+use std::fmt::{self, Write};
+use std::io;
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle, TermLike};
 use skein_protocol::progress::{LearnerPhase, ProgressReport};
 use skein_reports::Clock;
-use skein_run::note;
 use skein_run::terminal::{can_redraw, stderr_columns, wrapped};
+use skein_run::{note, notes};
 
 use crate::supervisor::{Restarts, Watcher};
 
@@ -44,8 +46,71 @@ pub fn bar_on_terminal() -> Option<ProgressBar> {
     }
     let style = ProgressStyle::with_template("{wide_bar:.blue/white.dim} {msg}")
         .expect("the template is well-formed");
-    let bar = ProgressBar::new(0).with_style(style.progress_chars("━━─"));
-    (!bar.is_hidden()).then_some(bar)
+    let target = ProgressDrawTarget::term_like(Box::new(Terminal::default()));
+    let bar = ProgressBar::with_draw_target(Some(0), target);
+    Some(bar.with_style(style.progress_chars("━━─")))
+}
+
+/// Standard error as a terminal that no redraw waits for.
+#[derive(Debug, Default)]
+struct Terminal {
+    /// What the present redraw has written.
+    drawn: Mutex<String>,
+}
+
+impl Terminal {
+    fn push(&self, text: fmt::Arguments<'_>) -> io::Result<()> {
+        let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
+        drawn.write_fmt(text).map_err(io::Error::other)
+    }
+
+    /// Moves the cursor by the control sequence that ends with `letter`.
+    fn move_cursor(&self, by: usize, letter: char) -> io::Result<()> {
+        match by {
+            0 => Ok(()),
+            _ => self.push(format_args!("\x1b[{by}{letter}")),
+        }
+    }
+}
+
+impl TermLike for Terminal {
+    fn width(&self) -> u16 {
+        stderr_columns().try_into().unwrap_or(u16::MAX)
+    }
+
+    fn move_cursor_up(&self, lines: usize) -> io::Result<()> {
+        self.move_cursor(lines, 'A')
+    }
+
+    fn move_cursor_down(&self, lines: usize) -> io::Result<()> {
+        self.move_cursor(lines, 'B')
+    }
+
+    fn move_cursor_right(&self, columns: usize) -> io::Result<()> {
+        self.move_cursor(columns, 'C')
+    }
+
+    fn move_cursor_left(&self, columns: usize) -> io::Result<()> {
+        self.move_cursor(columns, 'D')
+    }
+
+    fn write_line(&self, text: &str) -> io::Result<()> {
+        self.push(format_args!("{text}\n"))
+    }
+
+    fn write_str(&self, text: &str) -> io::Result<()> {
+        self.push(format_args!("{text}"))
+    }
+
+    fn clear_line(&self) -> io::Result<()> {
+        self.push(format_args!("\r\x1b[2K"))
+    }
+
+    fn flush(&self) -> io::Result<()> {
+        let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
+        notes::write(std::mem::take(&mut *drawn));
+        Ok(())
+    }
 }
 
 impl ProgressDisplay {

@@ -36,7 +36,7 @@ use skein_run::logging::environment_faults;
 use skein_run::signals::survive_file_size_limit;
 use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
-use skein_run::{note, show};
+use skein_run::{note, notes, show};
 
 use cli::{AttachArguments, Cli, Command, EncoderArguments, ReportArguments, RunArguments, Task};
 
@@ -59,6 +59,13 @@ static ALLOCATOR: EndWithoutMemory = EndWithoutMemory {
 
 fn main() -> ExitCode {
     survive_file_size_limit();
+    notes::never_wait();
+    let status = carry_out();
+    notes::settle();
+    status
+}
+
+fn carry_out() -> ExitCode {
     let outcome = match Cli::parse().command {
         Command::Run(arguments) => run(&arguments).map(status),
         Command::Attach(arguments) => attach(&arguments).map(status),

@@ -1,5 +1,7 @@
 //! Checks that a run can be resumed, and claims it.
 
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
@@ -93,14 +95,17 @@ pub fn resume(
         directory: directory.to_owned(),
         missing: missing.to_owned(),
     };
-    let run = RunDirectory::new(
-        directory
-            .canonicalize()
-            .map_err(|_| not_a_run(Path::new("run.json")))?,
-    );
-    if !run.identity().exists() {
-        return Err(not_a_run(Path::new("run.json")));
-    }
+    let unreadable = |path: &Path, source: io::Error| match source.kind() {
+        io::ErrorKind::NotFound | io::ErrorKind::NotADirectory => not_a_run(Path::new("run.json")),
+        _ => ResumeError::Run(RunError::Io {
+            path: path.to_owned(),
+            source,
+        }),
+    };
+    let root = directory.canonicalize();
+    let run = RunDirectory::new(root.map_err(|source| unreadable(directory, source))?);
+    let identity = run.identity();
+    fs::metadata(&identity).map_err(|source| unreadable(&identity, source))?;
     let (identity, config) = match episodes {
         // A lengthening that was cut off is repeated below.
         Some(_) => run.open_to_lengthen()?,
@@ -206,6 +211,14 @@ mod tests {
             let error = refusal(path);
             assert!(error.contains("is not a run directory"), "{error}");
         }
+        // There is something, but it cannot be read.
+        let file = directory.path().join("run.json");
+        std::os::unix::fs::symlink(&file, &file).unwrap();
+        let error = refusal(directory.path());
+        assert!(
+            error.contains("run.json") && !error.contains("not a run"),
+            "{error}"
+        );
     }
 
     #[test]

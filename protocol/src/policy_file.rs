@@ -10,7 +10,7 @@ use crate::snapshot::{Snapshot, SnapshotError, SnapshotLayout};
 #[derive(Debug, thiserror::Error)]
 pub enum PolicyError {
     /// The file cannot be read, or is no snapshot.
-    #[error("{key}: {source}; name a snapshot of this version")]
+    #[error("{key}: {source}")]
     File {
         /// Key that names the file.
         key: &'static str,

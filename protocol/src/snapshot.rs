@@ -370,7 +370,7 @@ impl Snapshot {
 fn remedy(error: &io::Error) -> &'static str {
     match error.kind() {
         io::ErrorKind::NotFound => {
-            "; name a file such as DIR/snapshots/best.safetensors, or a run with --run DIR"
+            "; name a file such as DIR/snapshots/best.safetensors of a run's directory DIR"
         }
         _ => "",
     }

@@ -346,8 +346,11 @@ fn snapshot_path(subject: &Subject) -> anyhow::Result<PathBuf> {
     let directory = RunDirectory::new(run);
     // For a run with an identity, this checks that its courses are those it was trained and
     // evaluated on.
-    if directory.identity().exists() {
-        directory.open()?;
+    let identity = directory.identity();
+    match identity.try_exists() {
+        Ok(true) => drop(directory.open()?),
+        Ok(false) => {}
+        Err(error) => return Err(error).with_context(|| identity.display().to_string()),
     }
     // A best snapshot that cannot be read is an error: the latest is another policy.
     let is_there = |path: &PathBuf| fs::symlink_metadata(path).is_ok();

@@ -115,9 +115,15 @@ impl Arguments {
             output.display()
         );
         let beside = |end: &str| output.with_file_name(format!("{stem}{end}"));
+        let checkpoint = beside(".checkpoint");
+        anyhow::ensure!(
+            output != checkpoint,
+            "--output {}: the training keeps its state there and removes it: name another file",
+            output.display()
+        );
         Ok(EncoderFiles {
             encoder: output.to_owned(),
-            checkpoint: beside(".checkpoint"),
+            checkpoint,
             curve: beside("_loss.csv"),
             curve_picture: beside("_loss.png"),
             reconstructions: beside("_reconstructions.png"),
@@ -140,6 +146,17 @@ mod tests {
         arguments
             .check_overrides()
             .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn an_output_that_the_training_would_remove_is_refused() {
+        let files = |output: &str| {
+            let command = ["skein encoder", "--config", "e.toml", "--output", output];
+            Arguments::parse_from(command).files()
+        };
+        let error = files("x.checkpoint").unwrap_err().to_string();
+        assert!(error.contains("x.checkpoint: the training"), "{error}");
+        assert_eq!(files("x").unwrap().checkpoint, Path::new("x.checkpoint"));
     }
 
     const TRAINING: [&str; 2] = ["--output", "e.safetensors"];

@@ -12,6 +12,7 @@ use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Config, Engine};
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::seeds::{Purpose, derive};
+use skein_run::failure::with_causes;
 use skein_run::{durable, note};
 use skein_simulator::simulator::SimulatorSettings;
 
@@ -78,6 +79,9 @@ impl<'a> Training<'a> {
                 "skein encoder: resuming after step {}",
                 training.vae.updates()
             );
+        } else {
+            // Shows before the first step whether its folder can be written.
+            training.save()?;
         }
         Ok(training)
     }
@@ -90,24 +94,30 @@ impl<'a> Training<'a> {
         let steps = self.config.encoder.steps;
         let mut progress = Progress::start(self.vae.updates(), steps);
         while self.vae.updates() < steps {
-            let point = self.next_point()?;
+            let point = self.next_point(stop)?;
             progress.show(&point);
             self.curve.push(point);
-            let stopped = stop.load(Ordering::Relaxed);
-            if stopped || self.curve.len().is_multiple_of(POINTS_PER_CHECKPOINT) {
-                self.save()?;
-            }
-            if stopped {
+            if stop.load(Ordering::Relaxed) {
                 progress.finish();
+                self.save()?;
                 return Ok(Ending::Interrupted(self.vae.updates()));
+            }
+            if self.curve.len().is_multiple_of(POINTS_PER_CHECKPOINT)
+                && let Err(error) = self.save()
+            {
+                note!(
+                    "skein encoder: not saved, goes on: {}",
+                    with_causes(error.as_ref())
+                );
             }
         }
         progress.finish();
         Ok(Ending::Completed)
     }
 
-    /// Makes the steps of a point of the curve.
-    fn next_point(&mut self) -> Result<CurvePoint> {
+    /// Makes the steps of a point of the curve, also those that are left once `stop` is set.
+    fn next_point(&mut self, stop: &AtomicBool) -> Result<CurvePoint> {
+        let mut is_told = false;
         let first = self.vae.updates();
         let end = self.config.encoder.steps.min(first + STEPS_PER_POINT);
         let mut sums = [0.0; COLUMNS];
@@ -116,6 +126,10 @@ impl<'a> Training<'a> {
             sums.iter_mut()
                 .zip(parts)
                 .for_each(|(sum, part)| *sum += part);
+            if stop.load(Ordering::Relaxed) && !is_told {
+                note!("skein encoder: stops after step {end} and saves; again to stop at once");
+                is_told = true;
+            }
         }
         let mut point = sums.map(|sum| sum / (end - first) as f64);
         point[0] = end as f64;
@@ -156,10 +170,10 @@ impl<'a> Training<'a> {
     }
 
     /// Writes the encoder and what shows how it was trained; removes the checkpoint. Returns the
-    /// encoder and its file.
+    /// encoder and its file. Tables and pictures that cannot be written are named and left out.
     ///
     /// # Errors
-    /// Names the file that cannot be written.
+    /// Names the encoder's file if it cannot be written, or the checkpoint.
     pub fn finish(mut self) -> Result<(TrainedEncoder, PathBuf)> {
         let mut values = vec![0.0; self.vae.published_len()];
         self.vae.publish(&mut values);
@@ -167,6 +181,24 @@ impl<'a> Training<'a> {
             values,
             latent: self.config.vae.latent,
         };
+        let path = self.files.encoder.clone();
+        durable::replace(&path, &encoder.to_file(self.config, self.vae.updates()))
+            .with_context(|| path.display().to_string())?;
+        if let Err(error) = self.describe() {
+            note!(
+                "skein encoder: the encoder is written; left out: {}",
+                with_causes(error.as_ref())
+            );
+        }
+        if self.files.checkpoint.exists() {
+            fs::remove_file(&self.files.checkpoint)
+                .with_context(|| self.files.checkpoint.display().to_string())?;
+        }
+        Ok((encoder, path))
+    }
+
+    /// Writes the curve as a table and a picture, and draws reconstructions.
+    fn describe(&mut self) -> Result<()> {
         curve::write(&self.curve, &self.files.curve)?;
         curve::draw(&self.curve, &self.files.curve_picture)?;
         let which = (self.config.run.seed, Purpose::MeasuredViews, 0);
@@ -177,15 +209,7 @@ impl<'a> Training<'a> {
             .map(|depth| (depth * 255.0).round_ties_even() as u8)
             .collect();
         skein_reports::draw_reconstructions(&views.images, &seen, &self.files.reconstructions)?;
-        // Last: a training is finished exactly when its encoder is there.
-        let path = self.files.encoder;
-        durable::replace(&path, &encoder.to_file(self.config, self.vae.updates()))
-            .with_context(|| path.display().to_string())?;
-        if self.files.checkpoint.exists() {
-            fs::remove_file(&self.files.checkpoint)
-                .with_context(|| self.files.checkpoint.display().to_string())?;
-        }
-        Ok((encoder, path))
+        Ok(())
     }
 }
 
@@ -248,7 +272,7 @@ mod tests {
         assert_eq!(ending, Ending::Interrupted(STEPS_PER_POINT));
         // Killed: nothing of these steps is saved.
         let mut killed = begin();
-        killed.next_point().unwrap();
+        killed.next_point(&go).unwrap();
         drop(killed);
         let mut resumed = begin();
         assert_eq!(resumed.vae.updates(), STEPS_PER_POINT);
@@ -273,6 +297,21 @@ mod tests {
             error.contains("mine.safetensors") && error.contains("--output"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn a_picture_that_cannot_be_drawn_costs_no_encoder() {
+        let (mut config, settings) = (config(), SimulatorSettings::default());
+        config.encoder.steps = 1;
+        let folder = tempfile::tempdir().unwrap();
+        let files = files(folder.path());
+        fs::create_dir(&files.reconstructions).unwrap();
+        let mut training = Training::begin(&config, &settings, files.clone()).unwrap();
+        assert!(files.checkpoint.exists(), "before the first step");
+        training.train(&AtomicBool::new(false)).unwrap();
+        let (encoder, file) = training.finish().unwrap();
+        assert_eq!(TrainedEncoder::load(&file).unwrap(), encoder);
+        assert!(files.curve.exists() && !files.checkpoint.exists());
     }
 
     #[test]

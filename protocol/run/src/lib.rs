@@ -5,7 +5,7 @@
 //! supervisor, and leftovers of dead processes are swept. Other modules hold what all of Skein's
 //! programs share: atomically written files ([`durable`]), logs ([`logging`]), allocator settings
 //! ([`allocation`]), errors on one line ([`failure`]), points at which tests kill a process
-//! ([`fault`]), output for the terminal ([`terminal`], [`tables`]), ignored signals ([`signals`]),
+//! ([`fault`]), output for the terminal ([`terminal`], [`notes`], [`tables`]), ignored signals ([`signals`]),
 //! limits of memory ([`control_groups`]).
 //!
 //! Identity and announcement are here and not in the protocol, because they name this machine's
@@ -24,6 +24,7 @@ mod inputs;
 mod lock;
 pub mod log_tail;
 pub mod logging;
+pub mod notes;
 pub mod orphans;
 mod presence;
 mod private_files;

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use rustix::process::Signal;
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use signal_hook::flag;
 
 /// Returns `true` if this process ignores the signal with this number. Ask before a handler is
@@ -19,14 +19,14 @@ pub fn is_ignored(number: i32) -> bool {
     is_in_mask(&status, number)
 }
 
-/// Returns a flag that SIGTERM and SIGINT set. One that comes while the flag is set ends the
+/// Returns a flag that SIGTERM, SIGINT and SIGHUP set. One that comes while the flag is set ends the
 /// process at once. One that was ignored when this process started stays ignored.
 ///
 /// # Errors
 /// If the system installs no handler.
 pub fn end_on_signal() -> io::Result<Arc<AtomicBool>> {
     let end = Arc::new(AtomicBool::new(false));
-    for number in [SIGTERM, SIGINT] {
+    for number in [SIGTERM, SIGINT, SIGHUP] {
         if !is_ignored(number) {
             // In this order: only the second signal finds the flag set.
             flag::register_conditional_default(number, end.clone())?;

@@ -10,14 +10,17 @@ use std::io::{self, IsTerminal, Write};
 use std::os::fd::AsFd;
 use std::path::Path;
 
+use crate::notes;
+
 /// Width of a terminal that does not report one.
 const USUAL_COLUMNS: usize = 80;
 
-/// Prints a line to standard output, as `println!` does. A failed write is ignored.
+/// Prints a line to standard output, as `println!` does, after all notes. A failed write is
+/// ignored.
 #[macro_export]
 macro_rules! show {
     ($($part:tt)*) => {
-        $crate::terminal::write_line(::std::io::stdout().lock(), ::std::format_args!($($part)*))
+        $crate::terminal::show_line(::std::format_args!($($part)*))
     };
 }
 
@@ -25,12 +28,18 @@ macro_rules! show {
 #[macro_export]
 macro_rules! note {
     ($($part:tt)*) => {
-        $crate::terminal::write_line(::std::io::stderr().lock(), ::std::format_args!($($part)*))
+        $crate::notes::write(::std::format!("{}\n", ::std::format_args!($($part)*)))
     };
 }
 
+/// Writes `text` and a line break to standard output; ignores a failure.
+pub fn show_line(text: Arguments<'_>) {
+    notes::settle();
+    write_line(io::stdout().lock(), text);
+}
+
 /// Writes `text` and a line break to `output` at once; ignores a failure.
-pub fn write_line(mut output: impl Write, text: Arguments<'_>) {
+fn write_line(mut output: impl Write, text: Arguments<'_>) {
     let _ = output.write_all(format!("{text}\n").as_bytes());
     let _ = output.flush();
 }

@@ -83,6 +83,28 @@ pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
     Shape::Polygon { points_m }
 }
 
+/// Corners around a centre, and a tongue of wall from one side that ends near the middle.
+pub(super) fn notch(rng: &mut impl Rng) -> Shape {
+    let (sides, half_width) = (rng.random_range(7..=10), rng.random_range(0.15..=0.3_f32));
+    let (end, taper) = (rng.random_range(-0.25..=0.1), rng.random_range(0.7..=1.1));
+    let beside = half_width.asin() / TAU;
+    let head = (0..=sides).map(|corner| {
+        let share = beside + (1.0 - 2.0 * beside) * corner as f32 / sides as f32;
+        let is_edge = corner == 0 || corner == sides;
+        polar(
+            share,
+            if is_edge {
+                1.0
+            } else {
+                rng.random_range(0.9..=1.1)
+            },
+        )
+    });
+    let mut points_m: Vec<_> = head.collect();
+    points_m.extend([-1.0, 1.0].map(|side| [end, side * taper * half_width]));
+    Shape::Polygon { points_m }
+}
+
 /// The unit disc without a second one: around on its own edge, back on the edge of the second.
 pub(super) fn crescent(rng: &mut impl Rng) -> Shape {
     const OUTER: usize = 12;
