@@ -22,7 +22,7 @@ pub(crate) struct Cli {
 const SCRIPTS: &str = "\
 The scripts in launch/ build what a command needs and hand over to it: run_local.sh (run), \
 attach_actor.sh (attach), encoder.sh (encoder), evaluate.sh (evaluate), experiment.sh \
-(experiment).";
+(experiment), export.sh (export).";
 
 /// The commands; the text of each stands at its arguments.
 #[derive(Subcommand)]
@@ -35,6 +35,7 @@ pub(crate) enum Command {
     Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
+    Export(ExportArguments),
     #[command(after_long_help = REPORT_NOTES)]
     Report(ReportArguments),
 }
@@ -194,6 +195,20 @@ suite under way is flown again the next time. A second Ctrl-C stops at once.
 
 Exit status: 0 every run is complete, 1 a run failed or something was refused, 2 wrong arguments, \
 130 interrupted.";
+
+/// Writes a snapshot as an ONNX graph, which programs without Skein run.
+///
+/// The graph holds encoder, policy and history: depth, velocity, history -> action, next_history.
+/// docs/python.md describes it.
+#[derive(Args)]
+pub(crate) struct ExportArguments {
+    /// Snapshot, such as DIR/snapshots/best.safetensors of a run.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) snapshot: PathBuf,
+    /// File to write; it is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) onnx: PathBuf,
+}
 
 const REPORT_NOTES: &str = "\
 Exit status: 0 drawn, 1 a plot could not be drawn or the run not be read, 2 wrong arguments.";

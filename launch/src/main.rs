@@ -38,7 +38,10 @@ use skein_run::terminal::{quoted, stdout_columns};
 use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 use skein_run::{note, notes, show};
 
-use cli::{AttachArguments, Cli, Command, EncoderArguments, ReportArguments, RunArguments, Task};
+use cli::{
+    AttachArguments, Cli, Command, EncoderArguments, ExportArguments, ReportArguments, RunArguments,
+    Task,
+};
 
 /// Contexts of errors that the operating system may return.
 const RUNTIME: &str = "cannot start the runtime";
@@ -74,6 +77,14 @@ fn carry_out() -> ExitCode {
         Command::Experiment(arguments) => {
             warn_of_environment();
             experiment::carry_out(&arguments)
+        }
+        Command::Export(ExportArguments { snapshot, onnx }) => {
+            skein_export::export(&snapshot, &onnx)
+                .map(|()| {
+                    show!("{}", onnx.display());
+                    ExitCode::SUCCESS
+                })
+                .map_err(Into::into)
         }
         Command::Report(arguments) => report(&arguments),
     };

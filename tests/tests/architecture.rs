@@ -178,6 +178,23 @@ fn every_package_has_only_its_allowed_dependencies() {
             &["skein-protocol", "skein-run", "skein-simulator"],
             &[torch, transport],
         ),
+        (
+            "skein-export",
+            &["skein-protocol"],
+            &[torch, physics, transport, tokio],
+        ),
+        (
+            "skein-python",
+            &[
+                "skein-export",
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-rollout",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
         // An experiment starts `skein run`: it knows no supervisor.
         (
             "skein-experiments",
@@ -196,6 +213,7 @@ fn every_package_has_only_its_allowed_dependencies() {
             &[
                 "skein-evaluate",
                 "skein-experiments",
+                "skein-export",
                 "skein-inference",
                 "skein-kernels",
                 "skein-prepare",

@@ -54,6 +54,26 @@ impl Courses {
         })
     }
 
+    /// Takes `courses` as the only evaluation courses.
+    pub fn of_courses(settings: SimulatorSettings, courses: Vec<Arc<Course>>) -> Self {
+        let entry = |course: Arc<Course>| EvaluationEntry {
+            entry: SuiteEntry {
+                name: course.name().to_owned(),
+                episodes: 1,
+                courses: EntryCourses::Listed(vec![course]),
+                disturbances: settings.disturbances.clone(),
+                max_steps: None,
+            },
+            settings: settings.clone(),
+        };
+        let evaluation = courses.into_iter().map(entry).collect();
+        Self {
+            settings,
+            training: None,
+            evaluation,
+        }
+    }
+
     /// Loads the files `paths` as the only evaluation courses, with the run's simulator settings.
     ///
     /// # Errors
@@ -267,7 +287,15 @@ fn load(path: &Path) -> Result<Arc<Course>, CoursesError> {
 }
 
 fn simulator_settings(config: &Config) -> Result<SimulatorSettings, CoursesError> {
-    toml::Value::Table(config.simulator.clone())
+    settings_of(config.simulator.clone())
+}
+
+/// Reads a `[simulator]` section.
+///
+/// # Errors
+/// [`CoursesError::Settings`] names the key.
+pub fn settings_of(section: toml::Table) -> Result<SimulatorSettings, CoursesError> {
+    toml::Value::Table(section)
         .try_into()
         .map_err(|error: toml::de::Error| {
             CoursesError::Settings(error.to_string().trim_end().replace('\n', " "))

@@ -318,7 +318,11 @@ fn is_last_of_segment(ticket: &Ticket, step: u32) -> bool {
     segment.is_some_and(|segment| step == ticket.first_step() + segment.steps)
 }
 
-fn reset<'a>(
+/// Starts the episode of `ticket`: everything random in it derives from the ticket's seed.
+///
+/// # Errors
+/// [`EpisodeFault`] if the ticket names a course or level that does not exist.
+pub fn reset<'a>(
     simulators: &'a mut Simulators,
     ticket: &Ticket,
 ) -> Result<&'a mut Simulator, EpisodeFault> {

@@ -11,6 +11,8 @@ mod linear;
 mod policy;
 
 use skein_kernels::Isa;
+use skein_protocol::config::{Observation, ObservationLayout};
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::{IMAGE_PIXELS, LatentCode};
@@ -39,6 +41,22 @@ pub struct Scratch {
 /// As [`Network::new`].
 pub fn encoder(snapshot: &Snapshot, layout: &SnapshotLayout) -> Encoder {
     Encoder::new(Isa::best(), tensors(snapshot, layout))
+}
+
+/// Returns the encoder of a file.
+///
+/// # Panics
+/// If the number of values does not fit the code's length, which [`TrainedEncoder::load`] refuses.
+pub fn trained_encoder(trained: &TrainedEncoder) -> Encoder {
+    // The encoder's tensors precede the policy's, whatever the policy.
+    let view = ObservationLayout::present(Observation::Latent, trained.latent);
+    let layout = SnapshotLayout::new(&view, 1);
+    Encoder::new(Isa::best(), |name| {
+        let tensor = layout
+            .tensor(name)
+            .expect("every layout has the encoder's tensors");
+        &trained.values[tensor.range.clone()]
+    })
 }
 
 /// Returns a function from a tensor's name to its values.

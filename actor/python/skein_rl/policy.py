@@ -1,0 +1,235 @@
+"""Trained policies, flown with the actor's own arithmetic."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core, task
+from .batch import IMAGE
+
+if TYPE_CHECKING:
+    from .env import CorridorEnv
+    from .torch import TorchPolicy
+
+_PIXELS = IMAGE[0] * IMAGE[1]
+
+
+class Policy:
+    """A snapshot's encoder and policy.
+
+    It remembers the episode, because a policy may see earlier steps. Call :meth:`reset` when an
+    episode begins, or tell :meth:`act` which ones do. Its actions are equal to an actor's, bit for
+    bit.
+
+    >>> policy = skein_rl.Policy.load("configs/snapshots/generalist.safetensors")
+    >>> policy.reset()
+    >>> action = policy.act(observation)
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, threads: int | None = None) -> None:
+        self._path = os.fspath(path)
+        self._threads = len(os.sched_getaffinity(0)) if threads is None else int(threads)
+        self._core = _core.Policy(self._path, max(1, self._threads))
+        self._seed = 0
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, threads: int | None = None) -> Policy:
+        """Reads a snapshot, for example ``DIR/snapshots/best.safetensors`` of a run.
+
+        Args:
+            path: the snapshot's file.
+            threads: threads that share a batch. Default: the processor's cores.
+
+        Raises:
+            ValueError: the file cannot be read or is no snapshot; the message names it.
+        """
+        return cls(path, threads=threads)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Configuration that it was trained with: dictionaries by section."""
+        return self._core.config
+
+    @property
+    def simulator(self) -> dict[str, Any]:
+        """Its section ``[simulator]``: ``CorridorEnv(simulator=policy.simulator)``."""
+        section: dict[str, Any] = self.config.get("simulator", {})
+        return section
+
+    @property
+    def version(self) -> int:
+        """Number of the snapshot within its run."""
+        return self._core.version
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the parameters, as in a run's reports."""
+        return self._core.sha256
+
+    @property
+    def latent(self) -> int:
+        """Length of the latent code."""
+        return self._core.latent
+
+    @property
+    def observation(self) -> str:
+        """What it sees of a step: ``latent``, ``latent+velocity`` or ``latent+velocity+action``."""
+        return self._core.observation
+
+    @property
+    def history_steps(self) -> list[int]:
+        """Numbers of steps back of the earlier steps that it also sees."""
+        return self._core.history_steps
+
+    def reset(self, n: int = 1, *, seed: int | Sequence[int] = 0) -> None:
+        """Forgets everything: ``n`` episodes begin.
+
+        Args:
+            n: rows of later batches.
+            seed: of the noise of ``act(…, deterministic=False)``; row i draws as an actor with a
+                ticket of ``seed + i``, or of ``seed[i]``.
+        """
+        several = isinstance(seed, Sequence)
+        seeds = list(seed) if several else [int(seed) + row for row in range(n)]  # type: ignore[arg-type,call-overload]
+        self._core.reset([task.seed_of(one) for one in seeds])
+
+    def act(
+        self,
+        observation: Mapping[str, npt.NDArray[Any]],
+        *,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> npt.NDArray[np.float32]:
+        """Chooses actions.
+
+        Args:
+            observation: one observation of :class:`skein_rl.CorridorEnv`, or a batch of
+                :class:`skein_rl.CorridorVectorEnv`: ``depth`` (or ``latent``), ``velocity`` and
+                ``previous_action``; without the last, the action returned before.
+            episode_start: bool ``[n]``, where an episode begins with this observation.
+            deterministic: False draws from the policy, as in training.
+
+        Returns:
+            float32 ``[2]``, or ``[n, 2]`` for a batch.
+
+        Raises:
+            KeyError: a part of the observation is missing.
+            ValueError: a shape or a number is wrong.
+        """
+        if "velocity" not in observation:
+            raise KeyError("the observation has no \"velocity\": observe it, float32 [3]")
+        velocity = np.asarray(observation["velocity"], dtype=np.float32)
+        single = velocity.ndim == 1
+        rows = 1 if single else len(velocity)
+        if self._core.count != rows:
+            if self._core.count:
+                raise ValueError(
+                    f"the observation has {rows} rows, {self._core.count} were there before: "
+                    f"call reset({rows}) first"
+                )
+            self.reset(rows)
+        depth, latent = observation.get("depth"), observation.get("latent")
+        if depth is None and latent is None:
+            raise KeyError("the observation has neither \"depth\" nor \"latent\"")
+        previous = observation.get("previous_action")
+        starts = np.zeros(rows, np.bool_) if episode_start is None else np.atleast_1d(episode_start)
+        block = self._core.act(
+            None if depth is None or latent is not None else _images(depth, rows),
+            None if latent is None else _numbers(latent),
+            _numbers(velocity),
+            None if previous is None else _numbers(previous),
+            starts.astype(np.bool_).tolist(),
+            not deterministic,
+        )
+        actions = np.frombuffer(block, np.float32).reshape(rows, 2).copy()
+        return actions[0] if single else actions
+
+    def encode(self, depth: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+        """Latent codes, float32 ``[n, latent]``, of depth images, uint8 ``[n, …, 72, 128]``."""
+        images = np.asarray(depth)
+        rows = images.size // _PIXELS
+        block = self._core.encode(_images(images, rows))
+        codes = np.frombuffer(block, np.float32).reshape(rows, self.latent).copy()
+        return codes[0] if images.ndim == 2 else codes
+
+    def parameters(self) -> dict[str, npt.NDArray[np.float32]]:
+        """Parameters by PyTorch's names, ``encoder.conv1.weight`` to ``policy.layer4.bias``."""
+        return {
+            name: np.frombuffer(data, dtype="<f4").reshape(shape).copy()
+            for name, shape, data in self._core.parameters()
+        }
+
+    def to_torch(self) -> TorchPolicy:
+        """Returns the networks as a ``torch.nn.Module``; needs ``pip install skein-rl[torch]``."""
+        from .torch import TorchPolicy
+
+        return TorchPolicy(self)
+
+    def to_onnx(self, path: str | os.PathLike[str] | None = None) -> bytes:
+        """Returns the networks as an ONNX graph, and writes it to ``path``: see ``docs/python.md``,
+        *Export*."""
+        graph = self._core.to_onnx()
+        if path is not None:
+            Path(path).write_bytes(graph)
+        return graph
+
+    def __reduce__(self) -> Any:
+        return _loaded, (self._path, self._threads)
+
+
+def _loaded(path: str, threads: int) -> Policy:
+    return Policy(path, threads=threads)
+
+
+def fly(
+    env: CorridorEnv,
+    policy: Policy,
+    seed: int,
+    *,
+    exploration: str = "mode",
+    options: Mapping[str, Any] | None = None,
+) -> dict[str, npt.NDArray[Any]]:
+    """Flies a whole episode as an actor does, by the actor's own loop.
+
+    Args:
+        env: what is flown; the environment itself is left as it is.
+        policy: who flies.
+        seed: the ticket's seed, as in ``env.reset(seed=…)``.
+        exploration: ``"mode"`` (none), ``"sample"`` (from the policy) or ``"uniform"``.
+        options: as in ``env.reset``.
+
+    Returns:
+        The columns of a recording, ``[steps + 1, …]``: see :func:`skein_rl.read_recording`.
+    """
+    wishes = task.wishes(options)
+    blocks = _core.fly(env._task, policy._core, task.seed_of(seed), exploration, **wishes)
+    rows = len(blocks["depth"]) // _PIXELS
+    columns: dict[str, npt.NDArray[Any]] = {}
+    for name, block in blocks.items():
+        kind = np.uint8 if name in _BYTES else np.float32
+        column = np.frombuffer(block, kind).copy()
+        columns[name] = column if column.size == rows else column.reshape(rows, -1)
+    columns["depth"] = columns["depth"].reshape(rows, *IMAGE)
+    return columns
+
+
+_BYTES = ("depth", "walls_passed", "terminated", "truncated")
+
+
+def _images(depth: Any, rows: int) -> bytes:
+    array = np.asarray(depth)
+    if array.dtype != np.uint8:
+        raise ValueError(f"depth has the dtype {array.dtype}: give uint8, 255 for the range")
+    if array.size != rows * _PIXELS or array.shape[-2:] != (72, 128):
+        raise ValueError(f"depth has the shape {array.shape}, not [{rows}, 1, 72, 128]")
+    return array.tobytes()
+
+
+def _numbers(numbers: Any) -> bytes:
+    return np.asarray(numbers, dtype=np.float32).tobytes()

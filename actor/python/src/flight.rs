@@ -1,0 +1,113 @@
+//! Whole episodes by the actor's own loop: what every other way to fly is compared with.
+
+use std::convert::Infallible;
+
+use bytemuck::Zeroable;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+use skein_protocol::ids::{ActorId, ActorIncarnation};
+use skein_protocol::ticket::Exploration;
+use skein_protocol::transition::TransitionRecord;
+use skein_rollout::agent::Agent;
+use skein_rollout::courses::Simulators;
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+
+use crate::policy::Policy;
+use crate::task::{Task, refused};
+
+/// Flies the episode of `seed` from its reset to its end, as an actor does. Returns the columns of
+/// a recording, `[steps + 1, …]`.
+#[pyfunction]
+#[pyo3(signature = (task, policy, seed, exploration, course=None, course_seed=None, level=None))]
+#[allow(clippy::too_many_arguments, reason = "the fields of a ticket")]
+pub(crate) fn fly<'py>(
+    py: Python<'py>,
+    task: &Task,
+    policy: &Policy,
+    seed: u64,
+    exploration: &str,
+    course: Option<Bound<'py, PyAny>>,
+    course_seed: Option<u64>,
+    level: Option<u8>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let choice = task.flown.choice(course.as_ref(), course_seed, level)?;
+    let mut ticket = task.flown.ticket(seed, 0, &choice)?;
+    ticket.exploration = exploration_of(exploration)?;
+    let simulators = Simulators::new(task.flown.courses.clone());
+    let agent = Agent::new(policy.config.observation_layout());
+    let mut memory = Memory::default();
+    py.detach(|| {
+        let mut flown = EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
+        flown.fly(&ticket, &policy.network, &mut memory)
+    })
+    .map_err(refused)?;
+    columns(py, &memory.sent, policy.config.vae.latent)
+}
+
+fn exploration_of(name: &str) -> PyResult<Exploration> {
+    match name {
+        "mode" => Ok(Exploration::Mode),
+        "sample" => Ok(Exploration::Sample),
+        "uniform" => Ok(Exploration::Uniform),
+        other => Err(refused(format!(
+            "exploration = {other:?} is none of \"mode\", \"sample\", \"uniform\""
+        ))),
+    }
+}
+
+/// Records of one episode.
+#[derive(Default)]
+struct Memory {
+    sent: Vec<Box<TransitionRecord>>,
+}
+
+impl RecordLink for Memory {
+    type Loan = Box<TransitionRecord>;
+    type Error = Infallible;
+
+    fn loan(&mut self) -> Result<Self::Loan, Infallible> {
+        Ok(Box::new(TransitionRecord::zeroed()))
+    }
+
+    fn send(&mut self, record: Self::Loan) -> Result<(), Infallible> {
+        self.sent.push(record);
+        Ok(())
+    }
+
+    fn directive(&mut self) -> Result<Directive, Infallible> {
+        Ok(Directive::Continue)
+    }
+}
+
+/// Returns the columns by name, each as bytes: u8 `[steps + 1, …]`, others f32.
+fn columns<'py>(
+    py: Python<'py>,
+    sent: &[Box<TransitionRecord>],
+    latent: usize,
+) -> PyResult<Bound<'py, PyDict>> {
+    let images: Vec<u8> = sent.iter().flat_map(|record| record.depth).collect();
+    let bytes = |of: fn(&TransitionRecord) -> u8| -> Bound<'py, PyBytes> {
+        let bytes: Vec<u8> = sent.iter().map(|record| of(record)).collect();
+        PyBytes::new(py, &bytes)
+    };
+    let numbers = |of: &dyn Fn(&TransitionRecord) -> &[f32]| -> Bound<'py, PyBytes> {
+        let numbers: Vec<f32> = sent.iter().flat_map(|record| of(record)).copied().collect();
+        PyBytes::new(py, bytemuck::cast_slice(&numbers))
+    };
+    let dict = PyDict::new(py);
+    dict.set_item("depth", PyBytes::new(py, &images))?;
+    dict.set_item("latent", numbers(&|record| &record.latent[..latent]))?;
+    dict.set_item("position_m", numbers(&|record| &record.position_m))?;
+    dict.set_item("orientation", numbers(&|record| &record.orientation))?;
+    dict.set_item("velocity_mps", numbers(&|record| &record.velocity_mps))?;
+    dict.set_item("action", numbers(&|record| &record.action))?;
+    dict.set_item("reward_terms", numbers(&|record| &record.reward_terms))?;
+    dict.set_item(
+        "reward",
+        numbers(&|record| std::slice::from_ref(&record.reward)),
+    )?;
+    dict.set_item("walls_passed", bytes(|record| record.walls_passed))?;
+    dict.set_item("terminated", bytes(|record| record.terminated))?;
+    dict.set_item("truncated", bytes(|record| record.truncated))?;
+    Ok(dict)
+}
