@@ -65,7 +65,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         self._task = task.build(keywords)
         self._parts = task.observed(observation, self._task)
         self.observation_space = task.observation_space(self._parts, self._task)  # type: ignore[assignment]
-        self.action_space = task.action_space()
+        self.action_space = task.action_space()  # type: ignore[assignment]
         self._fleet: Optional[_core.Fleet] = _core.Fleet(self._task, 1, 1, "Disabled")
         self._seeded = False
         self._window: Optional[render.Window] = None
@@ -133,7 +133,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         except RuntimeError as error:
             raise ResetNeeded(str(error)) from None
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """Returns an image from behind the drone with the depth image in a corner, uint8
         ``[288, 512, 3]``; None in the mode ``"human"``, which shows it in a window."""
         if self.render_mode is None:

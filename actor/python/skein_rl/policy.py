@@ -96,7 +96,7 @@ class Policy:
                 ticket of ``seed + i``, or of ``seed[i]``.
         """
         several = isinstance(seed, Sequence)
-        seeds = list(seed) if several else [int(seed) + row for row in range(n)]  # type: ignore[arg-type,call-overload]
+        seeds = list(seed) if several else [int(seed) + row for row in range(n)]  # type: ignore[arg-type]
         self._core.reset([task.seed_of(one) for one in seeds])
 
     def act(
@@ -147,16 +147,16 @@ class Policy:
             starts.astype(np.bool_).tolist(),
             not deterministic,
         )
-        actions = np.frombuffer(block, np.float32).reshape(rows, 2).copy()
-        return actions[0] if single else actions
+        actions: npt.NDArray[np.float32] = np.frombuffer(block, np.float32).copy()
+        return actions if single else actions.reshape(rows, 2)
 
     def encode(self, depth: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Latent codes, float32 ``[n, latent]``, of depth images, uint8 ``[n, …, 72, 128]``."""
         images = np.asarray(depth)
         rows = images.size // _PIXELS
         block = self._core.encode(_images(images, rows))
-        codes = np.frombuffer(block, np.float32).reshape(rows, self.latent).copy()
-        return codes[0] if images.ndim == 2 else codes
+        codes: npt.NDArray[np.float32] = np.frombuffer(block, np.float32).copy()
+        return codes if images.ndim == 2 else codes.reshape(rows, self.latent)
 
     def parameters(self) -> dict[str, npt.NDArray[np.float32]]:
         """Parameters by PyTorch's names, ``encoder.conv1.weight`` to ``policy.layer4.bias``."""

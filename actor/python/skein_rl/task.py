@@ -151,7 +151,10 @@ def _level(level: Any) -> int:
 def _several(courses: Any) -> list[Any]:
     if isinstance(courses, (str, os.PathLike, Mapping)):
         return [courses]
-    return list(courses)
+    try:
+        return list(courses)
+    except TypeError:
+        raise TypeError(f"courses = {courses!r} is neither a course nor a list of them") from None
 
 
 def _path(course: Any) -> Any:

@@ -13,7 +13,7 @@ except ImportError:
 from .policy import Policy
 
 
-class TorchPolicy(nn.Module):
+class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
     """Encoder, policy and history, with the inputs and outputs of the ONNX graph.
 
     ``forward(depth, velocity, history)`` returns ``(action, next_history)``. A history is zeros at

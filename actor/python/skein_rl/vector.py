@@ -58,7 +58,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         self._keywords = dict(keywords)
         self._task = task.build(keywords)
         self._parts = task.observed(observation, self._task)
-        self.single_observation_space = task.observation_space(self._parts, self._task)  # type: ignore[assignment]
+        self.single_observation_space = task.observation_space(self._parts, self._task)
         self.single_action_space = task.action_space()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -75,7 +75,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         """Names of the courses; ``info["course"]`` holds indices into them."""
         return self._task.course_names
 
-    def reset(  # type: ignore[override]
+    def reset(
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
@@ -141,7 +141,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         except RuntimeError as error:
             raise ResetNeeded(str(error)) from None
 
-    def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
         """Returns an image of each environment, as ``CorridorEnv.render``."""
         if self.render_mode is None:
             return None
@@ -220,6 +220,11 @@ def _values(batch: Batch) -> Batch:
 
 def _infos(batch: Batch, mask: npt.NDArray[np.bool_]) -> dict[str, Any]:
     infos = _values(batch)
+    if not mask.all():
+        # The observation may share these arrays.
+        infos = {key: column.copy() for key, column in infos.items()}
+        for column in infos.values():
+            column[~mask] = None if column.dtype == object else 0
     return {**infos, **{f"_{key}": mask.copy() for key in infos}}
 
 

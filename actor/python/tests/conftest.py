@@ -57,3 +57,38 @@ def rollout(env, seed, steps, policy=None, options=None):
         if results[-1][2] or results[-1][3]:
             results.append(env.reset())
     return results
+
+
+def snapshot_file(path, config, latent, step_len, history, outputs, width=16, seed=1):
+    """Writes a snapshot with random parameters, as a run does. ``config``: its TOML."""
+    import struct
+
+    from safetensors.numpy import save_file
+    from xxhash import xxh3_64
+
+    shapes, channels = {}, (1, 32, 64, 128, 256)
+    for n in range(4):
+        shapes[f"encoder.conv{n + 1}"] = (channels[n + 1], channels[n], 4, 4)
+    shapes["encoder.mean"] = (latent, 3072)
+    widths = (step_len * (1 + len(history)), width, width, width, outputs)
+    for n in range(4):
+        shapes[f"policy.layer{n + 1}"] = (widths[n + 1], widths[n])
+    rng = np.random.default_rng(seed)
+    tensors = {}
+    for name, shape in shapes.items():
+        bound = min(np.sqrt(1 / np.prod(shape[1:])) * 1.7, 0.5)
+        tensors[f"{name}.weight"] = rng.uniform(-bound, bound, shape).astype(np.float32)
+        tensors[f"{name}.bias"] = rng.uniform(-0.1, 0.1, shape[0]).astype(np.float32)
+    digest = xxh3_64()
+    for text in ("7", config):
+        digest.update(struct.pack("<Q", len(text)) + text.encode())
+    for tensor in tensors.values():
+        digest.update(tensor.tobytes())
+    metadata = {
+        "skein.format": "policy-snapshot-2",
+        "skein.policy_version": "7",
+        "skein.config": config,
+        "skein.checksum": digest.hexdigest(),
+    }
+    save_file(tensors, path, metadata)
+    return path

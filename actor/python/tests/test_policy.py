@@ -81,9 +81,10 @@ def test_what_is_wrong_is_named(policy, env, tmp_path):
 
 
 def test_it_says_what_it_is(policy):
-    assert policy.latent == 64 and policy.observation == "latent+velocity+action"
-    assert policy.history_steps == [1, 2, 3, 4, 5, 6]
-    assert policy.config["learning"]["algorithm"] == "distill"
+    config = policy.config
+    assert policy.latent == config["vae"]["latent"]
+    assert policy.observation == config["learning"]["observation"]
+    assert policy.history_steps == config["learning"]["history_steps"]
     assert len(policy.sha256) == 64
     assert policy.parameters()["encoder.conv1.weight"].shape == (32, 1, 4, 4)
     assert pickle.loads(pickle.dumps(policy)).sha256 == policy.sha256
