@@ -1,19 +1,26 @@
 //! Whole episodes by the actor's own loop: what every other way to fly is compared with.
 
 use std::convert::Infallible;
+use std::hint::black_box;
 
 use bytemuck::Zeroable;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::Simulators;
-use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
+use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink, reset};
 
+use skein_simulator::reward::RewardTerms;
+
+use crate::parallel::for_each;
 use crate::policy::Policy;
-use crate::task::{Task, refused};
+use crate::task::{Choice, Flown, Task, refused};
 
 /// Flies the episode of `seed` from its reset to its end, as an actor does. Returns the columns of
 /// a recording, `[steps + 1, …]`.
@@ -42,6 +49,45 @@ pub(crate) fn fly<'py>(
     })
     .map_err(refused)?;
     columns(py, &memory.sent, policy.config.vae.latent)
+}
+
+/// Flies `steps` steps on each of `threads` simulators, with random actions: reset, step, image and
+/// reward, and nothing of Python. The measure of what the environments add.
+#[pyfunction]
+pub(crate) fn simulate(py: Python<'_>, task: &Task, threads: usize, steps: u64) -> PyResult<()> {
+    let flown = &task.flown;
+    let mut results: Vec<PyResult<()>> = (0..threads).map(|_| Ok(())).collect();
+    py.detach(|| {
+        let jobs = results.iter_mut().enumerate();
+        let jobs: Vec<_> = jobs.collect();
+        for_each(threads, jobs.into_iter(), |(index, result)| {
+            *result = simulate_alone(flown, index as u64, steps);
+        });
+    });
+    results.into_iter().collect()
+}
+
+fn simulate_alone(flown: &Flown, seed: u64, steps: u64) -> PyResult<()> {
+    let mut simulators = Simulators::new(flown.courses.clone());
+    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+    let settings = &flown.courses.settings().reward;
+    let mut image = Box::new([0; IMAGE_PIXELS]);
+    let mut ended = true;
+    let mut ticket = flown.ticket(seed, 0, &Choice::default())?;
+    for _ in 0..steps {
+        if ended {
+            ticket = flown.ticket(rng.random(), 0, &Choice::default())?;
+            let simulator = reset(&mut simulators, &ticket).map_err(refused)?;
+            simulator.render(&mut image);
+        }
+        let simulator = simulators.of(&ticket).map_err(refused)?;
+        let action = std::array::from_fn(|_| rng.random_range(-1.0..=1.0));
+        let report = simulator.step(action).map_err(refused)?;
+        simulator.render(&mut image);
+        black_box(RewardTerms::of(settings, &report, &image));
+        ended = report.outcome.is_some();
+    }
+    Ok(())
 }
 
 fn exploration_of(name: &str) -> PyResult<Exploration> {

@@ -33,6 +33,7 @@ fn core(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(task::read_config, module)?)?;
     module.add_function(wrap_pyfunction!(task::parse_toml, module)?)?;
     module.add_function(wrap_pyfunction!(flight::fly, module)?)?;
+    module.add_function(wrap_pyfunction!(flight::simulate, module)?)?;
     module.add("REWARD_TERMS", skein_protocol::REWARD_TERM_NAMES.to_vec())?;
     module.add("COLUMNS", batch::names())?;
     module.add("MOST_MPS", environment::MOST_MPS)?;

@@ -15,8 +15,8 @@ use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use skein_rollout::courses::{Courses, settings_of};
-use skein_simulator::camera::DepthCamera;
 use skein_simulator::course::Course;
+use skein_simulator::simulator::Simulator;
 
 use crate::values::{dict_of, table_of};
 
@@ -154,11 +154,8 @@ impl Flown {
             let (corridor, start) = ranges.longest();
             settings.check_reach(corridor, start).map_err(refused)?;
             self.check_levels("random courses", ranges.most_walls())?;
-            DepthCamera::new(
-                &settings.camera,
-                &Course::generate(0, ranges).map_err(refused)?,
-            )
-            .map_err(refused)?;
+            let course = Course::generate(0, ranges).map_err(refused)?;
+            Simulator::new(Arc::new(course), settings).map_err(refused)?;
         }
         self.listed
             .iter()

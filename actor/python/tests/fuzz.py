@@ -174,8 +174,9 @@ def main(calls, seed):
         except Exception:
             # An environment that cannot fly any more makes room for others.
             if rng.random() < 0.05 or getattr(env, "_fleet", None) is None:
-                envs[envs.index(env)] = rng.choice([skein_rl.CorridorEnv, lambda: skein_rl.make_vec(2)])()
-                envs[0].reset(seed=1) if envs[0]._fleet else None
+                made = rng.choice([skein_rl.CorridorEnv, lambda: skein_rl.make_vec(2)])()
+                made.reset(seed=1)
+                envs[next(place for place, one in enumerate(envs) if one is env)] = made
     print(f"{done} calls, {worked} worked, {time.time() - began:.0f} s, seed {seed}")
 
 

@@ -174,6 +174,7 @@ def test_settings_come_from_keywords_and_files(tmp_path):
         ({"vehicle": {"mass": 3}}, "mass"),
         ({"vehicle": 3}, "vehicle = 3"),
         ({"reward": {"collision": float("nan")}}, "collision"),
+        ({"reward": {"collision": 1e19}, "courses": "random"}, "collision"),
         ({"levels": 6}, "levels: 6"),
         ({"levels": 0}, "level = 0"),
         ({"levels": []}, "levels"),
