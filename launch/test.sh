@@ -7,7 +7,7 @@ source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked -- "$@" <<END
 launch/test.sh checks formatting and lints, builds everything, and runs all tests, in the release profile: what is tested is
-what runs. Then it runs each benchmark for a moment, to see that it works; no time is judged. At the end, or when something
+what runs. Then it builds, installs and tests the Python package, and runs each benchmark for a moment, to see that it works; no time is judged. At the end, or when something
 fails, it prints where the time went.
 
 Exit status: 0 all passed, 1 something did not, 2 wrong arguments.
@@ -77,6 +77,9 @@ begin "build: tests"
 cargo test --release --locked --workspace --tests --no-run
 begin tests
 CARGO_TERM_COLOR=never cargo test --release --locked --workspace --tests 2>&1 | tee "$tests"
+# The wheel in a fresh environment. Built alone, it has a build of its dependencies of its own.
+begin "Python package, with its build"
+"$repository/launch/python.sh" --test
 # Every benchmark, the rare ones too.
 begin "benchmarks, with their build"
 "$repository/tests/bench.sh" --quick --growth

@@ -1,4 +1,4 @@
-"""Steps a second of the vector environment, beside the simulator alone on as many threads.
+"""Steps a second of the vector environment, beside as many simulators alone on as many threads.
 
     python vector.py [ENVIRONMENTS] [ROUNDS]
 
@@ -38,7 +38,7 @@ def main(environments, rounds):
                     env.step(actions)
 
             def alone():
-                _core.simulate(env._task, threads, STEPS // threads)
+                _core.simulate(env._task, environments, threads, STEPS // environments)
 
             ours(), alone()
             pairs = [(spent(ours), spent(alone)) for _ in range(rounds)]

@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
-use skein_protocol::ticket::Exploration;
+use skein_protocol::ticket::{Exploration, Ticket};
 use skein_protocol::transition::TransitionRecord;
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::Simulators;
@@ -51,43 +51,71 @@ pub(crate) fn fly<'py>(
     columns(py, &memory.sent, policy.config.vae.latent)
 }
 
-/// Flies `steps` steps on each of `threads` simulators, with random actions: reset, step, image and
-/// reward, and nothing of Python. The measure of what the environments add.
+/// Flies `steps` steps with each of `environments` simulators on `threads` threads, with random
+/// actions: reset, step, image and reward, and nothing of Python. The measure of what the
+/// environments add.
 #[pyfunction]
-pub(crate) fn simulate(py: Python<'_>, task: &Task, threads: usize, steps: u64) -> PyResult<()> {
+pub(crate) fn simulate(
+    py: Python<'_>,
+    task: &Task,
+    environments: usize,
+    threads: usize,
+    steps: u64,
+) -> PyResult<()> {
     let flown = &task.flown;
-    let mut results: Vec<PyResult<()>> = (0..threads).map(|_| Ok(())).collect();
-    py.detach(|| {
-        let jobs = results.iter_mut().enumerate();
-        let jobs: Vec<_> = jobs.collect();
-        for_each(threads, jobs.into_iter(), |(index, result)| {
-            *result = simulate_alone(flown, index as u64, steps);
+    let alone: PyResult<Vec<_>> = (0..environments)
+        .map(|index| Alone::new(flown, index as u64))
+        .collect();
+    let mut alone = alone?;
+    let share = environments.div_ceil(threads.max(1)).max(1);
+    let results = py.detach(|| {
+        let mut results: Vec<PyResult<()>> = alone.chunks(share).map(|_| Ok(())).collect();
+        let jobs: Vec<_> = alone.chunks_mut(share).zip(&mut results).collect();
+        for_each(threads, jobs.into_iter(), |(alone, result)| {
+            let mut image = Box::new([0; IMAGE_PIXELS]);
+            *result = (0..steps).try_for_each(|_| {
+                let mut each = alone.iter_mut();
+                each.try_for_each(|alone| alone.step(flown, &mut image))
+            });
         });
+        results
     });
     results.into_iter().collect()
 }
 
-fn simulate_alone(flown: &Flown, seed: u64, steps: u64) -> PyResult<()> {
-    let mut simulators = Simulators::new(flown.courses.clone());
-    let mut rng = Pcg64Mcg::seed_from_u64(seed);
-    let settings = &flown.courses.settings().reward;
-    let mut image = Box::new([0; IMAGE_PIXELS]);
-    let mut ended = true;
-    let mut ticket = flown.ticket(seed, 0, &Choice::default())?;
-    for _ in 0..steps {
-        if ended {
-            ticket = flown.ticket(rng.random(), 0, &Choice::default())?;
-            let simulator = reset(&mut simulators, &ticket).map_err(refused)?;
-            simulator.render(&mut image);
-        }
-        let simulator = simulators.of(&ticket).map_err(refused)?;
-        let action = std::array::from_fn(|_| rng.random_range(-1.0..=1.0));
-        let report = simulator.step(action).map_err(refused)?;
-        simulator.render(&mut image);
-        black_box(RewardTerms::of(settings, &report, &image));
-        ended = report.outcome.is_some();
+/// A simulator without anything around it.
+struct Alone {
+    simulators: Simulators,
+    rng: Pcg64Mcg,
+    ticket: Ticket,
+    ended: bool,
+}
+
+impl Alone {
+    fn new(flown: &Flown, seed: u64) -> PyResult<Self> {
+        Ok(Self {
+            simulators: Simulators::new(flown.courses.clone()),
+            rng: Pcg64Mcg::seed_from_u64(seed),
+            ticket: flown.ticket(seed, 0, &Choice::default())?,
+            ended: true,
+        })
     }
-    Ok(())
+
+    fn step(&mut self, flown: &Flown, image: &mut [u8; IMAGE_PIXELS]) -> PyResult<()> {
+        if self.ended {
+            self.ticket = flown.ticket(self.rng.random(), 0, &Choice::default())?;
+            let simulator = reset(&mut self.simulators, &self.ticket).map_err(refused)?;
+            simulator.render(image);
+        }
+        let simulator = self.simulators.of(&self.ticket).map_err(refused)?;
+        let action = std::array::from_fn(|_| self.rng.random_range(-1.0..=1.0));
+        let report = simulator.step(action).map_err(refused)?;
+        simulator.render(image);
+        let settings = &flown.courses.settings().reward;
+        black_box(RewardTerms::of(settings, &report, image));
+        self.ended = report.outcome.is_some();
+        Ok(())
+    }
 }
 
 fn exploration_of(name: &str) -> PyResult<Exploration> {
