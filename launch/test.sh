@@ -7,8 +7,8 @@ source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked -- "$@" <<END
 launch/test.sh checks formatting and lints, builds everything, and runs all tests, in the release profile: what is tested is
-what runs. Then it builds, installs and tests the Python package, and runs each benchmark for a moment, to see that it works; no time is judged. At the end, or when something
-fails, it prints where the time went.
+what runs. Then it builds, installs and tests the Python package, and runs each benchmark for a moment, to see that it works; no
+time is judged. At the end, or when something fails, it prints where the time went.
 
 Exit status: 0 all passed, 1 something did not, 2 wrong arguments.
 END

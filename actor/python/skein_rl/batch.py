@@ -17,13 +17,14 @@ _PIXELS = IMAGE[0] * IMAGE[1]
 # Type and width of each column; 0 is a single number a row. `src/batch.rs` has the order.
 _KINDS: dict[str, tuple[Any, int]] = {
     "reward": (np.float64, 0),
-    "seed": (np.uint64, 0),
-    "course_seed": (np.uint64, 0),
+    "seed": (np.int64, 0),
+    "course_seed": (np.int64, 0),
     "course": (np.int64, 0),
     "step": (np.int64, 0),
     "level": (np.int64, 0),
     "walls_passed": (np.int64, 0),
     "hit_wall": (np.int64, 0),
+    "outcome": (np.int64, 0),
     "velocity": (np.float32, 3),
     "previous_action": (np.float32, 2),
     "reward_terms": (np.float32, len(_core.REWARD_TERMS)),
@@ -31,7 +32,6 @@ _KINDS: dict[str, tuple[Any, int]] = {
     "orientation": (np.float32, 4),
     "ground_truth": (np.float32, 18),
     "latent": (np.float32, 64),
-    "outcome": (np.uint8, 0),
     "terminated": (np.bool_, 0),
     "truncated": (np.bool_, 0),
 }

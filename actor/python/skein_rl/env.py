@@ -13,7 +13,7 @@ from typing_extensions import Unpack
 
 from . import _core, render, task
 from .batch import Batch, arrays
-from .task import OUTCOMES, TaskKeywords
+from .task import TaskKeywords
 
 Observation = dict[str, npt.NDArray[Any]]
 Action = npt.NDArray[np.float32]
@@ -204,7 +204,6 @@ def actions_of(actions: Any, shape: tuple[int, ...]) -> bytes:
 
 def _info(batch: Batch) -> dict[str, Any]:
     info: dict[str, Any] = {key: batch[key][0] for key in ARRAYS}
-    info["outcome"] = OUTCOMES[batch["outcome"][0]]
     info.update({key: batch[key][0] for key in INTEGERS})
     return info
 
@@ -212,5 +211,14 @@ def _info(batch: Batch) -> dict[str, Any]:
 ARRAYS = ("reward_terms", "ground_truth", "position_m", "orientation")
 """Parts of ``info`` that are arrays."""
 
-INTEGERS = ("walls_passed", "level", "hit_wall", "step", "seed", "course", "course_seed")
+INTEGERS = (
+    "outcome",
+    "walls_passed",
+    "level",
+    "hit_wall",
+    "step",
+    "seed",
+    "course",
+    "course_seed",
+)
 """Parts of ``info`` that are integers."""

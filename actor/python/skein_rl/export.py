@@ -178,7 +178,7 @@ def _use(name: str) -> str:
         "    action = policy.act(observation)\n"
         "    observation, reward, terminated, truncated, info = env.step(action)\n"
         "    ended = terminated or truncated\n"
-        'print(info["outcome"], info["walls_passed"])\n```'
+        'print(skein_rl.OUTCOMES[info["outcome"]], info["walls_passed"])\n```'
     )
 
 

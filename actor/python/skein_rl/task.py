@@ -17,7 +17,7 @@ OBSERVABLE = ("depth", "latent", "velocity", "previous_action", "ground_truth")
 """Parts of an observation."""
 
 OUTCOMES = ("flying", "collided", "reached_end", "timed_out")
-"""Values of ``info["outcome"]``."""
+"""Names of the values of ``info["outcome"]``."""
 
 _GROUND_TRUTH = 18
 _SECTIONS = ("vehicle", "camera", "reward", "generator", "disturbances")

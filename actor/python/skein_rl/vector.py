@@ -16,9 +16,8 @@ from typing_extensions import Unpack
 from . import _core, render, task
 from .batch import Batch, arrays
 from .env import ARRAYS, INTEGERS, Observation, actions_of
-from .task import OUTCOMES, TaskKeywords
+from .task import TaskKeywords
 
-_OUTCOMES = np.array(OUTCOMES, dtype=object)
 
 
 class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDArray[Any]]):
@@ -197,8 +196,6 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
             for key, value in _values(batch).items():
                 if key not in final:
                     final[key] = np.zeros((self.num_envs, *value.shape[1:]), dtype=value.dtype)
-                    if value.dtype == object:
-                        final[key][:] = None
                 final[key][index] = value[0]
         infos["final_obs"], infos["_final_obs"] = final_obs, mask
         infos["final_info"] = {**final, **{f"_{key}": mask.copy() for key in final}}
@@ -213,9 +210,7 @@ def make_vec(
 
 
 def _values(batch: Batch) -> Batch:
-    values = {key: batch[key] for key in (*ARRAYS, *INTEGERS)}
-    values["outcome"] = _OUTCOMES[batch["outcome"]]
-    return values
+    return {key: batch[key] for key in (*ARRAYS, *INTEGERS)}
 
 
 def _infos(batch: Batch, mask: npt.NDArray[np.bool_]) -> dict[str, Any]:
@@ -224,7 +219,7 @@ def _infos(batch: Batch, mask: npt.NDArray[np.bool_]) -> dict[str, Any]:
         # The observation may share these arrays.
         infos = {key: column.copy() for key, column in infos.items()}
         for column in infos.values():
-            column[~mask] = None if column.dtype == object else 0
+            column[~mask] = 0
     return {**infos, **{f"_{key}": mask.copy() for key in infos}}
 
 

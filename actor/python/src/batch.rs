@@ -13,7 +13,6 @@ use crate::environment::Moment;
 /// Number of a column.
 enum Column {
     F64(fn(&Moment) -> f64),
-    U64(fn(&Moment) -> u64),
     I64(fn(&Moment) -> i64),
     F32(&'static dyn Fn(&Moment) -> &[f32]),
     U8(fn(&Moment) -> u8),
@@ -22,13 +21,14 @@ enum Column {
 /// Columns behind images and latent codes: name, as `skein_rl/batch.py` calls it, and content.
 const COLUMNS: [(&str, Column); 18] = [
     ("reward", Column::F64(|m| f64::from(m.reward))),
-    ("seed", Column::U64(|m| m.seed)),
-    ("course_seed", Column::U64(|m| m.course_seed)),
+    ("seed", Column::I64(|m| m.seed.cast_signed())),
+    ("course_seed", Column::I64(|m| m.course_seed.cast_signed())),
     ("course", Column::I64(|m| m.course.into())),
     ("step", Column::I64(|m| m.step.into())),
     ("level", Column::I64(|m| m.level.into())),
     ("walls_passed", Column::I64(|m| m.walls_passed.into())),
     ("hit_wall", Column::I64(|m| m.hit_wall.into())),
+    ("outcome", Column::I64(|m| m.outcome.into())),
     ("velocity", Column::F32(&|m| &m.velocity_mps)),
     ("previous_action", Column::F32(&|m| &m.previous_action)),
     ("reward_terms", Column::F32(&|m| &m.reward_terms)),
@@ -36,7 +36,6 @@ const COLUMNS: [(&str, Column); 18] = [
     ("orientation", Column::F32(&|m| &m.orientation)),
     ("ground_truth", Column::F32(&|m| &m.ground_truth)),
     ("latent", Column::F32(&|m| &m.latent)),
-    ("outcome", Column::U8(|m| m.outcome)),
     ("terminated", Column::U8(|m| m.terminated.into())),
     ("truncated", Column::U8(|m| m.truncated.into())),
 ];
@@ -76,7 +75,6 @@ fn write(moments: &[Moment], mut block: &mut [u8]) {
         for moment in moments {
             match column {
                 Column::F64(of) => put(&of(moment).to_ne_bytes()),
-                Column::U64(of) => put(&of(moment).to_ne_bytes()),
                 Column::I64(of) => put(&of(moment).to_ne_bytes()),
                 Column::F32(of) => put(bytemuck::cast_slice(of(moment))),
                 Column::U8(of) => put(&[of(moment)]),
@@ -89,7 +87,7 @@ impl Column {
     /// Bytes of one row.
     fn bytes(&self) -> usize {
         match self {
-            Self::F64(_) | Self::U64(_) | Self::I64(_) => 8,
+            Self::F64(_) | Self::I64(_) => 8,
             Self::F32(of) => size_of_val(of(&Moment::EMPTY)),
             Self::U8(_) => 1,
         }

@@ -110,7 +110,8 @@ impl EpisodeSeeds {
         self.next_episode += 1;
         match episode {
             0 => (self.first, 0),
-            later => (derive(self.first, Purpose::Episode, later), later),
+            // Not above what the signed integers of frameworks hold.
+            later => (derive(self.first, Purpose::Episode, later) >> 1, later),
         }
     }
 }

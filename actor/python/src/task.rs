@@ -178,7 +178,8 @@ impl Flown {
         // Everything is drawn, so that one wish does not change the rest.
         let mut rng = Pcg64Mcg::seed_from_u64(derive(seed, Purpose::Course, 0));
         let generated = rng.random::<f64>() < self.generated_share;
-        let course_seed: u64 = rng.random();
+        // Not above what the signed integers of frameworks hold.
+        let course_seed = rng.random::<u64>() >> 1;
         let (place, level): (u64, u64) = (rng.random(), rng.random());
         let drawn = match self.listed.len() as u64 {
             0 => CoursePick::Generated,
