@@ -35,6 +35,7 @@ pub(crate) enum Command {
     Evaluate(skein_evaluate::Arguments),
     #[command(after_long_help = EXPERIMENT_NOTES)]
     Experiment(ExperimentArguments),
+    #[command(after_long_help = EXPORT_NOTES)]
     Export(ExportArguments),
     #[command(after_long_help = REPORT_NOTES)]
     Report(ReportArguments),
@@ -209,6 +210,9 @@ pub(crate) struct ExportArguments {
     #[arg(long, value_name = "FILE")]
     pub(crate) onnx: PathBuf,
 }
+
+const EXPORT_NOTES: &str = "\
+Exit status: 0 written, 1 the snapshot cannot be read or the file not be written, 2 wrong arguments.";
 
 const REPORT_NOTES: &str = "\
 Exit status: 0 drawn, 1 a plot could not be drawn or the run not be read, 2 wrong arguments.";

@@ -39,8 +39,8 @@ use skein_run::{RunDirectory, RunError, SupervisorLock, sweep_leftovers};
 use skein_run::{note, notes, show};
 
 use cli::{
-    AttachArguments, Cli, Command, EncoderArguments, ExportArguments, ReportArguments, RunArguments,
-    Task,
+    AttachArguments, Cli, Command, EncoderArguments, ExportArguments, ReportArguments,
+    RunArguments, Task,
 };
 
 /// Contexts of errors that the operating system may return.

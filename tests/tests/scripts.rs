@@ -73,6 +73,7 @@ fn every_help_says_in_the_same_words_that_wrong_arguments_end_with_status_2() {
         "evaluate",
         "experiment",
         "report",
+        "export",
         "encoder",
     ];
     let helps = scripts()
@@ -103,6 +104,8 @@ fn wrong_arguments_end_with_status_2_and_a_line_on_the_remedy() {
     for script in [
         "launch/setup.sh",
         "launch/test.sh",
+        "launch/python.sh",
+        "launch/peers.sh",
         "tests/bench.sh",
         "tests/fuzz.sh",
     ] {
@@ -118,6 +121,7 @@ fn wrong_arguments_end_with_status_2_and_a_line_on_the_remedy() {
         "evaluate",
         "experiment",
         "report",
+        "export",
         "encoder",
     ] {
         let output = run_program("skein", &[command, "--nonsense"]);

@@ -81,12 +81,3 @@ def test_torchrl_collects_a_batch():
     assert tuple(batch.batch_size) == (3, 40)
     assert batch["depth"].shape[-2:] == (72, 128)
     assert batch["next", "done"].any()
-
-
-def test_pufferlib_steps_it():
-    emulation = pytest.importorskip("pufferlib.emulation")
-    env = emulation.GymnasiumPufferEnv(env_creator=lambda **_: skein_rl.CorridorEnv())
-    env.reset(seed=1)
-    for _ in range(5):
-        observation, *_ = env.step(np.zeros(2, np.float32))
-    assert observation.nbytes >= 72 * 128
