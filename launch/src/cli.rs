@@ -212,7 +212,7 @@ pub(crate) struct ExportArguments {
 }
 
 const EXPORT_NOTES: &str = "\
-Exit status: 0 written, 1 the snapshot cannot be read or the file not be written, 2 wrong arguments.";
+Exit status: 0 written, 1 the snapshot cannot be read or the file not written, 2 wrong arguments.";
 
 const REPORT_NOTES: &str = "\
 Exit status: 0 drawn, 1 a plot could not be drawn or the run not be read, 2 wrong arguments.";

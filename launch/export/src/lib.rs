@@ -3,9 +3,9 @@
 //!
 //! | name | type, shape | meaning |
 //! |---|---|---|
-//! | `depth` | u8 `[batch, 1, 72, 128]` | depth image; 255 is the camera's range or farther |
+//! | `depth` | u8 `[batch, 1, 72, 128]` | depth image; 255 is the range or farther |
 //! | `velocity` | f32 `[batch, 3]` | forward, left, up, m/s |
-//! | `history` | f32 `[batch, rows, width]` | zeros at a reset; else the last call's `next_history` |
+//! | `history` | f32 `[batch, rows, width]` | zeros at a reset, else the last `next_history` |
 //! | `action` | f32 `[batch, 2]` | velocity to command left and up, m/s, in [-1, 1] |
 //! | `next_history` | as `history` | for the next call |
 //!
@@ -51,7 +51,10 @@ pub enum ExportError {
         path: PathBuf,
     },
     /// The graph cannot be written.
-    #[error("cannot write the graph to {}: {source}; name a file in a folder that exists", path.display())]
+    #[error(
+        "cannot write the graph to {}: {source}; name a file in a folder that exists",
+        path.display()
+    )]
     Write {
         /// The file.
         path: PathBuf,
