@@ -145,7 +145,7 @@ class Policy:
             _numbers(velocity),
             None if previous is None else _numbers(previous),
             starts.astype(np.bool_).tolist(),
-            not deterministic,
+            "mode" if deterministic else "sample",
         )
         actions: npt.NDArray[np.float32] = np.frombuffer(block, np.float32).copy()
         return actions if single else actions.reshape(rows, 2)

@@ -61,6 +61,9 @@ type State = (u64, u64, Option<FlightState>);
 /// Number, seed, course (index or -1, seed), level and actions.
 type FlightState = (u64, u64, i64, u64, u8, Vec<[f32; ACTION]>);
 
+/// A batch, and the ends of episodes that a step also reset, by environment.
+type Drawn<'py> = (Bound<'py, PyByteArray>, Vec<(usize, Last)>);
+
 /// A batch, and of each episode that ended in a step that also reset its index and last moment.
 type Stepped<'py> = (
     Bound<'py, PyByteArray>,
@@ -202,7 +205,7 @@ impl Fleet {
         work: impl Fn(usize, &mut Environment, &mut [u8; IMAGE_PIXELS]) -> Result<Done, Failure>
         + Sync
         + Send,
-    ) -> PyResult<(Bound<'py, PyByteArray>, Vec<(usize, Last)>)> {
+    ) -> PyResult<Drawn<'py>> {
         let (count, threads) = (self.environments.len(), self.threads);
         let mut lasts = Vec::new();
         let drawn = batch(py, count, |images| {

@@ -118,7 +118,11 @@ impl Alone {
     }
 }
 
-fn exploration_of(name: &str) -> PyResult<Exploration> {
+/// Reads the name of a choice of actions.
+///
+/// # Errors
+/// `ValueError` names the choices.
+pub(crate) fn exploration_of(name: &str) -> PyResult<Exploration> {
     match name {
         "mode" => Ok(Exploration::Mode),
         "sample" => Ok(Exploration::Sample),

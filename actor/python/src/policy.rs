@@ -18,6 +18,7 @@ use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode, MAX_LATENT};
 use skein_rollout::agent::Agent;
 
 use crate::fleet::rows_of;
+use crate::flight::exploration_of;
 use crate::parallel::for_each;
 use crate::task::refused;
 use crate::values::dict_of;
@@ -90,7 +91,7 @@ impl Policy {
         velocities: &[u8],
         previous: Option<&[u8]>,
         starts: Vec<bool>,
-        sample: bool,
+        exploration: &str,
     ) -> PyResult<Bound<'py, PyBytes>> {
         let (count, latent) = (self.rows.len(), self.config.vae.latent);
         let seen = Seen {
@@ -111,10 +112,7 @@ impl Policy {
                 starts.len()
             )));
         }
-        let exploration = match sample {
-            true => Exploration::Sample,
-            false => Exploration::Mode,
-        };
+        let exploration = exploration_of(exploration)?;
         let Self {
             rows,
             network,
@@ -124,7 +122,10 @@ impl Policy {
         py.detach(|| {
             let jobs: Vec<_> = rows.iter_mut().zip(starts).enumerate().collect();
             for_each(*threads, jobs.into_iter(), |(index, (row, starts))| {
-                row.act(network, &seen, index, starts, exploration);
+                if starts {
+                    row.restart();
+                }
+                row.act(network, &seen, index, exploration);
             });
         });
         let actions: Vec<_> = self.rows.iter().map(|row| row.last_action).collect();
@@ -244,17 +245,12 @@ impl Seen<'_> {
 }
 
 impl Row {
-    fn act(
-        &mut self,
-        network: &Network,
-        seen: &Seen<'_>,
-        index: usize,
-        starts: bool,
-        exploration: Exploration,
-    ) {
-        if starts {
-            (self.next_step, self.last_action) = (0, [0.0; ACTION]);
-        }
+    /// Begins another episode.
+    fn restart(&mut self) {
+        (self.next_step, self.last_action) = (0, [0.0; ACTION]);
+    }
+
+    fn act(&mut self, network: &Network, seen: &Seen<'_>, index: usize, exploration: Exploration) {
         let record = &mut self.record;
         record.step = self.next_step;
         record.velocity_mps = seen.velocities[index];
