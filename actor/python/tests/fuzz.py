@@ -150,6 +150,8 @@ def main(calls, seed):
             [80, 5, 1, 0.5, 0.3, 0.5, 3, 8, 2],
         )[0]
         done += 1
+        if done % 50_000 == 0:
+            print(f"{done} calls, {worked} worked, {time.time() - began:.0f} s", flush=True)
         try:
             if kind == "step":
                 act(rng, env)
