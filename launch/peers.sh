@@ -5,8 +5,8 @@ set -euo pipefail
 source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked -- "$@" <<END
-launch/peers.sh [--bench] sets up PyTorch, stable-baselines3 and TorchRL (pinned, 5 GB) in an environment of their own, with the
-package skein-rl, and runs the tests that need them. The environment is python/peers in cargo's target directory.
+launch/peers.sh [--bench] sets up PyTorch, stable-baselines3, TorchRL, Minari and W&B (pinned, 6 GB) in an environment of their
+own, with the package skein-rl, and runs the tests that need them. The environment is python/peers in cargo's target directory.
 
   --bench   then print steps a second of the vector environment, beside the simulator alone
 
@@ -32,5 +32,5 @@ package=$repository/actor/python
 # From the tests' folder, so that the installed package is what is tested.
 cd "$package/tests"
 "$venv/bin/python" -m pip --disable-pip-version-check list 2>/dev/null | grep -E '^(gymnasium|numpy|skein|stable|torch)'
-SDL_VIDEODRIVER=dummy "$venv/bin/python" -m pytest -q -p no:cacheprovider test_peers.py test_policy.py
+SDL_VIDEODRIVER=dummy "$venv/bin/python" -m pytest -q -p no:cacheprovider test_peers.py test_policy.py test_data.py
 [[ $bench == no ]] || "$venv/bin/python" ../benches/vector.py
