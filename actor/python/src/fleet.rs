@@ -27,7 +27,7 @@ pub(crate) struct Fleet {
     autoreset: Autoreset,
 }
 
-/// What follows the end of an episode, as Gymnasium names it.
+/// Sequel to the end of an episode, as Gymnasium names it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Autoreset {
     /// The next step resets, and its action is ignored.
@@ -38,7 +38,7 @@ enum Autoreset {
     Disabled,
 }
 
-/// What one environment did in a step.
+/// Result of a step of one environment.
 struct Done {
     moment: Moment,
     /// Last image and moment of an episode that ended in a step that also reset.

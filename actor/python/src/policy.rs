@@ -185,7 +185,7 @@ impl Policy {
         self.config.vae.latent
     }
 
-    /// What the policy sees of each step, as the configuration names it.
+    /// Policy input per step, as the configuration names it.
     #[getter]
     fn observation(&self) -> &'static str {
         match self.config.learning.observation {
@@ -207,7 +207,7 @@ impl Policy {
     }
 }
 
-/// What the rows of a batch see.
+/// Inputs of the rows of a batch.
 struct Seen<'a> {
     images: Option<&'a [[u8; IMAGE_PIXELS]]>,
     /// Codes back to back, `latent` numbers each.

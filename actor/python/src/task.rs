@@ -1,4 +1,4 @@
-//! What an environment flies: settings, courses, levels, encoder.
+//! Task of an environment: settings, courses, levels, encoder.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -40,7 +40,7 @@ const SHIPPED: [(&str, &str); 4] = [
     ),
 ];
 
-/// What is flown; immutable, shared by all environments that fly it.
+/// Task to fly; immutable, shared by all environments that fly it.
 #[pyclass(frozen, module = "skein_rl._core")]
 pub(crate) struct Task {
     pub(crate) flown: Arc<Flown>,
