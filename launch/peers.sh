@@ -5,8 +5,8 @@ set -euo pipefail
 source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 help_if_asked -- "$@" <<END
-launch/peers.sh [--bench] sets up PyTorch, stable-baselines3, TorchRL, Minari and W&B (pinned, 6 GB) in an environment of their
-own, with the package skein-rl, and runs the tests that need them. The environment is python/peers in cargo's target directory.
+launch/peers.sh [--bench] sets up PyTorch, stable-baselines3, TorchRL, Minari, W&B, MLflow and Trackio (pinned, 7 GB) in an environment
+of their own, with the package skein-rl, and runs the tests that need them. The environment is python/peers in cargo's target directory.
 
   --bench   then print steps a second of the vector environment, beside the simulator alone
 
