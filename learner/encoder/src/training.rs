@@ -117,7 +117,7 @@ impl<'a> Training<'a> {
 
     /// Makes the steps of a point of the curve, also those that are left once `stop` is set.
     fn next_point(&mut self, stop: &AtomicBool) -> Result<CurvePoint> {
-        let mut is_told = false;
+        let mut announced = false;
         let first = self.vae.updates();
         let end = self.config.encoder.steps.min(first + STEPS_PER_POINT);
         let mut sums = [0.0; COLUMNS];
@@ -126,9 +126,9 @@ impl<'a> Training<'a> {
             sums.iter_mut()
                 .zip(parts)
                 .for_each(|(sum, part)| *sum += part);
-            if stop.load(Ordering::Relaxed) && !is_told {
+            if stop.load(Ordering::Relaxed) && !announced {
                 note!("skein encoder: stops after step {end} and saves; again to stop at once");
-                is_told = true;
+                announced = true;
             }
         }
         let mut point = sums.map(|sum| sum / (end - first) as f64);
