@@ -210,6 +210,10 @@ fn failed(
 /// Draws the plots. They are optional: a run that failed may still have left something to draw, and
 /// a run that succeeded is a success without them.
 fn draw_if_possible(run: &RunDirectory, config: &Config) {
+    // A run that was removed does not come back as a folder of plots.
+    if !run.root().exists() {
+        return;
+    }
     let Ok(plots) = catch_unwind(AssertUnwindSafe(|| draw(run, config))) else {
         note!("skein: some plots could not be drawn: the drawing panicked");
         return;

@@ -221,9 +221,10 @@ fn a_supervisor_stopped_for_longer_than_its_deadlines_continues_where_it_was() {
 fn a_run_whose_directory_is_removed_says_so() {
     let run = long_run();
     // Moved, not removed: that is done at once, whatever the processes create meanwhile.
-    let root = run.directory().root();
-    std::fs::rename(root, root.with_extension("moved")).unwrap();
+    let root = run.directory().root().to_owned();
+    std::fs::rename(&root, root.with_extension("moved")).unwrap();
     let ended = run.wait();
+    assert!(!root.exists(), "a checkpoint made the folder again");
     ended
         .output
         .assert_refused(&["was removed", "start a new run"]);

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use serde::de::{DeserializeOwned, Error};
@@ -96,9 +97,15 @@ fn key_before(text: &str, start: usize) -> &str {
 }
 
 /// Returns `true` if `name` can be shown on a terminal and in a table: it is one line, without
-/// control characters and `|`.
+/// control characters, signs that turn the direction of writing round, and `|`.
 pub fn fits_in_a_table(name: &str) -> bool {
-    !name.contains(|sign: char| sign.is_control() || sign == '|')
+    const TURNS: [RangeInclusive<char>; 3] = [
+        '\u{200e}'..='\u{200f}',
+        '\u{202a}'..='\u{202e}',
+        '\u{2066}'..='\u{2069}',
+    ];
+    let turns = |sign| TURNS.iter().any(|turn| turn.contains(&sign));
+    !name.contains(|sign: char| sign.is_control() || turns(sign) || sign == '|')
 }
 
 /// Returns the first of `items` that an earlier one equals.

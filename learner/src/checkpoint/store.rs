@@ -93,7 +93,11 @@ impl CheckpointStore {
         state: &CheckpointState,
         relied_on: &[PathBuf],
     ) -> Result<(), CheckpointError> {
-        durable::create_private_directory(aside).map_err(CheckpointError::io("create", aside))?;
+        // Not the run's own directory: a run that was removed does not come back as a folder.
+        for folder in [&self.directory, aside] {
+            durable::create_private_directory(folder)
+                .map_err(CheckpointError::io("create", folder))?;
+        }
         die_if_armed(FaultPoint::CheckpointCreated);
         files::write(aside, state, &self.config.portable())?;
         self.seal(aside, state.progress.episodes)?;

@@ -11,7 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use prost::Message;
 use serde::{Deserialize, Serialize};
-use skein_run::write_event_record;
+use skein_run::{durable, write_event_record};
 
 use crate::disk::{Disk, PatientWriter};
 use crate::notice::notify_user;
@@ -66,7 +66,7 @@ impl EventWriter {
         disk: &Disk,
     ) -> Result<Self, EventError> {
         let at = |path: PathBuf| move |source| EventError { path, source };
-        fs::create_dir_all(directory).map_err(at(directory.to_owned()))?;
+        durable::create_private_directory(directory).map_err(at(directory.to_owned()))?;
         let (files, others): (Vec<_>, Vec<_>) = files
             .into_iter()
             .partition(|file| CreationStamp::of(&file.name).is_some());

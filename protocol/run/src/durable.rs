@@ -48,12 +48,15 @@ pub fn create_private(path: &Path) -> io::Result<File> {
         .open(path)
 }
 
-/// Creates the directory at `path` and missing parents, accessible for the user only.
+/// Creates the directory at `path` if it is missing, accessible for the user only.
 ///
 /// # Errors
-/// Errors of the file system.
+/// Errors of the file system, such as a missing parent.
 pub fn create_private_directory(path: &Path) -> io::Result<()> {
-    DirBuilder::new().recursive(true).mode(0o700).create(path)
+    match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() == io::ErrorKind::AlreadyExists && path.is_dir() => Ok(()),
+        created => created,
+    }
 }
 
 /// Syncs a file, or the names in a directory, to disk.

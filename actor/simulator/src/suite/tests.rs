@@ -204,6 +204,10 @@ fn a_suite_that_cannot_be_flown_is_refused_by_file_entry_and_key() {
             "entry \"\\u{1b}[2J\": its name cannot be shown",
         ),
         (
+            of_entry("[entry.generated]\n[[entry]]\nname = \"\\u202e\""),
+            "its name cannot be shown",
+        ),
+        (
             of_entry("[entry.generated]\n[[entry]]\nname = \" \""),
             "entry \" \": its name cannot be shown",
         ),

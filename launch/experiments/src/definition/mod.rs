@@ -172,7 +172,7 @@ pub enum DefinitionError {
     },
     /// No experiment has this name.
     #[error(
-        "no experiment is called {name}: {} holds {known}; give one of these names, \
+        "no experiment is called \"{name}\": {} holds {known}; give one of these names, \
          or the path of a file, FOLDER/NAME.toml",
         folder.display()
     )]

@@ -578,7 +578,7 @@ fn an_unknown_name_is_refused_with_the_known_names() {
         .unwrap_err()
         .to_string();
     assert!(
-        error.contains("no experiment is called papre") && error.contains("paper"),
+        error.contains("no experiment is called \"papre\"") && error.contains("paper"),
         "{error}"
     );
     assert!(Experiment::load(&shipped("experiments"), "../smoke", None).is_err());
