@@ -1,23 +1,24 @@
 #!/usr/bin/env bash
-# Builds the Python package skein-rl and installs it.
+# Builds the Python packages skein-rl and skein-rl-actor and installs them.
 set -euo pipefail
 # shellcheck source=common.sh
 source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/common.sh"
 
 # The tool that builds the wheel, in an environment of its own.
 readonly MATURIN=maturin==1.16.0
-# Largest wheel, MB.
+# Largest wheel of each package, MB.
 readonly LARGEST_MB=15
 # Random calls of the fuzz test.
 readonly FUZZ_CALLS=20000
 
 help_if_asked -- "$@" <<END
-launch/python.sh [--venv DIR] [--test] builds the wheel of the Python package skein-rl and installs it into a virtual environment.
+launch/python.sh [--venv DIR] [--test] builds the wheels of the Python packages skein-rl and skein-rl-actor and installs them into a virtual
+environment. The second holds what joins a run: skein_rl.Actor.
 
   --venv DIR   the environment; it is created if it does not exist [default: python/venv in cargo's target directory]
   --test       create a fresh environment beside it, then check types, run the package's tests and a short fuzz in it
 
-The wheel goes to python/wheels in cargo's target directory. You need python3 from 3.10 on, with pip and venv, and a network for
+The wheels go to python/wheels in cargo's target directory. You need python3 from 3.10 on, with pip and venv, and a network for
 pip. libtorch is not needed.
 
 Exit status: 0 installed, 1 failed, 2 wrong arguments.
@@ -62,19 +63,21 @@ create() {
     [[ -x $1/bin/python ]] || python3 -m venv "$1" || fail "cannot create a virtual environment in $1"
 }
 
-# Cargo gets the settings of .cargo/config.toml from the repository. The variable tells PyO3 not to link libpython, which the
-# interpreter that loads the package brings.
+# Builds the wheel of a package into a folder of its own; $wheels gets its path too. Cargo gets the settings of .cargo/config.toml
+# from the repository. The variable tells PyO3 not to link libpython, which the interpreter that loads the package brings.
 build_wheel() {
+    local package=$1 about=$2 built=$work/wheels/$(basename "$1") wheel
     create "$work/build"
     [[ -x $work/build/bin/maturin ]] || pip_of "$work/build" install "$MATURIN"
-    rm -rf "$work/wheels"
+    rm -rf "$built"
     (cd "$repository" && PYO3_BUILD_EXTENSION_MODULE=1 "$work/build/bin/maturin" build --release --locked \
-        --manifest-path actor/python/Cargo.toml --out "$work/wheels" --interpreter "$work/build/bin/python" 2>&1) |
-        say_once "building the wheel (about 2 minutes on two cores the first time)" >&2 ||
+        --manifest-path "$package/Cargo.toml" --out "$built" --interpreter "$work/build/bin/python" 2>&1) |
+        say_once "building the wheel $about" >&2 ||
         fail "the build failed; maturin's messages above say why"
-    wheel=$(find "$work/wheels" -name '*.whl')
+    wheel=$(find "$built" -name '*.whl')
     [[ $(stat -c %s "$wheel") -le $((LARGEST_MB * 1000000)) ]] ||
         fail "$wheel has $(stat -c %s "$wheel") bytes, more than $LARGEST_MB MB: look for what made it grow"
+    wheels+=("$wheel")
 }
 
 run_tests() {
@@ -82,6 +85,7 @@ run_tests() {
     pip_of "$venv" install --requirement "$tests/requirements.txt"
     program=$target/release/skein-evaluate
     [[ ! -x $program ]] || export SKEIN_EVALUATE=$program
+    [[ ! -x $target/release/skein-learner ]] || export SKEIN=$target/release/skein
     # From the tests' folder, so that the installed package is what is tested.
     cd "$tests"
     "$venv/bin/python" -m mypy --config-file ../pyproject.toml --package skein_rl
@@ -94,11 +98,13 @@ target=$(target_directory)
 work=$target/python
 venv=${venv:-$work/venv}
 mkdir -p "$work"
-build_wheel
+wheels=()
+build_wheel actor/python "skein-rl (about 2 minutes on two cores the first time)"
+build_wheel actor/python/actor "skein-rl-actor (about a minute more)"
 [[ $test == no ]] || rm -rf "$work/test"
 [[ $test == no ]] || venv=$work/test
 create "$venv"
-pip_of "$venv" install --force-reinstall --no-deps "$wheel"
-pip_of "$venv" install "$wheel"
+pip_of "$venv" install --force-reinstall --no-deps "${wheels[@]}"
+pip_of "$venv" install "${wheels[@]}"
 [[ $test == no ]] || run_tests
 [[ $test == yes ]] || echo "skein-rl is installed: $venv/bin/python -c 'import skein_rl'"

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 use clap::Parser;
@@ -102,5 +103,6 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
             Agent::new(trained.observation_layout()),
         );
     }
+    let exit_requested = || exit_requested.load(Ordering::Relaxed);
     Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
 }

@@ -8,7 +8,6 @@ mod connection;
 #[cfg(test)]
 mod tests;
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::sleep;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -24,19 +23,19 @@ use tracing::{debug, info, info_span, warn};
 use self::connection::LearnerConnection;
 use skein_inference::Network;
 use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
+use skein_rollout::world::Worlds;
 
 /// Longest time between two tries to join a learner, and between two checks of the exit request
 /// meanwhile.
 const JOIN_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Serves the learners of a run, one incarnation after the other.
-#[derive(Debug)]
 pub struct Service<'a> {
     identity: &'a RunIdentity,
     config: &'a Config,
     actor: ActorId,
-    /// Checked between two steps and between two tries to join.
-    exit_requested: &'a AtomicBool,
+    /// Asked between two steps, between two tries to join, and after each wait.
+    exit_requested: &'a dyn Fn() -> bool,
     incarnation: ActorIncarnation,
     /// Time of the last heartbeat from a learner; at first, the start of this service.
     last_heard: Instant,
@@ -48,7 +47,7 @@ pub struct Service<'a> {
 pub enum ExitReason {
     /// The learner reported the end of the run.
     Stopped,
-    /// This process received a signal.
+    /// This process received a signal, or has another reason of its own.
     Signalled,
     /// No learner of this run sent a heartbeat for `transport.learner_silence_secs`.
     LearnerSilent,
@@ -73,7 +72,7 @@ impl<'a> Service<'a> {
         identity: &'a RunIdentity,
         config: &'a Config,
         actor: ActorId,
-        exit_requested: &'a AtomicBool,
+        exit_requested: &'a dyn Fn() -> bool,
     ) -> Self {
         Self {
             identity,
@@ -92,9 +91,9 @@ impl<'a> Service<'a> {
     /// [`JoinError`] if this process can never join a learner of this run, or could not join the
     /// existing one for `transport.learner_silence_secs`. A lost episode or learner is not an
     /// error.
-    pub fn serve(
+    pub fn serve<W: Worlds>(
         mut self,
-        environment_loop: &mut EnvironmentLoop,
+        environment_loop: &mut EnvironmentLoop<W>,
     ) -> Result<ExitReason, JoinError> {
         loop {
             let ports = match self.find_learner()? {
@@ -137,7 +136,7 @@ impl<'a> Service<'a> {
         let mut last_refusal = None;
         let interval = JOIN_INTERVAL.min(self.config.transport.heartbeat());
         loop {
-            if self.exit_requested.load(Ordering::Relaxed) {
+            if (self.exit_requested)() {
                 return Ok(Err(ExitReason::Signalled));
             }
             match ActorPorts::join(self.identity, self.config) {
@@ -184,8 +183,8 @@ fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
 }
 
 /// Serves the joined learner.
-fn serve_learner(
-    environment_loop: &mut EnvironmentLoop,
+fn serve_learner<W: Worlds>(
+    environment_loop: &mut EnvironmentLoop<W>,
     connection: &mut LearnerConnection<'_>,
 ) -> Result<DisconnectReason, ServiceError> {
     connection.report(ActorState::Serving)?;
@@ -210,8 +209,8 @@ fn serve_learner(
     Ok(disconnect_reason)
 }
 
-fn fly(
-    environment_loop: &mut EnvironmentLoop,
+fn fly<W: Worlds>(
+    environment_loop: &mut EnvironmentLoop<W>,
     ticket: &Ticket,
     network: &Network,
     connection: &mut LearnerConnection<'_>,
@@ -236,6 +235,8 @@ fn fly(
         }
         Err(EpisodeError::Abandoned) => info!("episode abandoned"),
         Err(EpisodeError::Fault(fault)) => warn!(%fault, "episode failed"),
+        // Whoever flies in such an environment also requests the exit.
+        Err(EpisodeError::Foreign(fault)) => warn!(fault, "the environment failed"),
         // The ticket's deadline covers it.
         Err(EpisodeError::Link(error)) => warn!(%error, "episode lost"),
     }

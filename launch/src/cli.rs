@@ -80,8 +80,9 @@ pub(crate) struct RunArguments {
         value_parser = clap::value_parser!(u64).range(1..)
     )]
     pub(crate) episodes: Option<u64>,
-    /// Actors to start [default: number of cores].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    /// Actors to start [default: number of cores]. With 0, the run waits for actors that join it:
+    /// `skein attach`, or an environment of yours in Python.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32))]
     pub(crate) actors: Option<u32>,
     /// Change one setting of the config, for example --set run.seed=7; may be repeated.
     ///

@@ -195,6 +195,21 @@ fn every_package_has_only_its_allowed_dependencies() {
             ],
             &[torch, transport, tokio],
         ),
+        // What joins a run, and so the transport, is a wheel of its own.
+        (
+            "skein-python-actor",
+            &[
+                "skein-actor",
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-rollout",
+                "skein-run",
+                "skein-simulator",
+                "skein-transport",
+            ],
+            &[torch, tokio],
+        ),
         // An experiment starts `skein run`: it knows no supervisor.
         (
             "skein-experiments",

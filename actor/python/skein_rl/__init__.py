@@ -15,6 +15,7 @@ from gymnasium.envs.registration import register, registry
 
 from . import export, sb3
 from ._core import REWARD_TERMS, SHIPPED_COURSES, __version__
+from .actor import Actor
 from .data import Recording, Run, read_recording, read_run, to_minari
 from .env import CorridorEnv
 from .policy import Policy, fly
@@ -26,6 +27,7 @@ __all__ = [
     "OUTCOMES",
     "REWARD_TERMS",
     "SHIPPED_COURSES",
+    "Actor",
     "CorridorEnv",
     "CorridorVectorEnv",
     "Policy",

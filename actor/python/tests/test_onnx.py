@@ -1,8 +1,11 @@
 """The ONNX graph, beside the actor's arithmetic."""
 
+import os
+import subprocess
+
 import numpy as np
 import pytest
-from conftest import snapshot_file
+from conftest import CONFIGS, snapshot_file
 
 import skein_rl
 
@@ -78,9 +81,8 @@ def test_the_shipped_policy_agrees_on_whole_episodes(policy, tmp_path):
     assert largest_difference(policy, session, 150) < 5e-5
 
 
-def test_it_agrees_with_a_recorded_episode(policy, recording, tmp_path):
-    policy.to_onnx(tmp_path / "graph.onnx")
-    session = session_of(tmp_path / "graph.onnx")
+def differences_by_course(session, recording):
+    """Differences of the graph's actions from recorded ones, a number a step."""
     recorded = skein_rl.read_recording(recording)
     differences = {}
     for episode in recorded.episodes():
@@ -94,9 +96,36 @@ def test_it_agrees_with_a_recorded_episode(policy, recording, tmp_path):
             }
             action, history = session.run(None, inputs)
             differences.setdefault(course, []).append(np.abs(action[0] - expected).max())
+    return differences
+
+
+def test_it_agrees_with_a_recorded_episode(policy, recording, tmp_path):
+    policy.to_onnx(tmp_path / "graph.onnx")
+    differences = differences_by_course(session_of(tmp_path / "graph.onnx"), recording)
     assert max(differences["training"]) < 1e-5
     for of_course in differences.values():
         assert np.quantile(of_course, 0.95) < 1e-5 and max(of_course) < 5e-5
+
+
+def test_the_snapshot_of_a_run_agrees_with_its_recorded_episodes(tmp_path):
+    """A run of smoke.toml, shortened, by the real programs; its evaluation, recorded."""
+    program = os.environ.get("SKEIN")
+    if not program:
+        pytest.skip("SKEIN names no program: launch/python.sh sets it once skein is built")
+    run, recording = tmp_path / "run", tmp_path / "episodes.npz"
+    snapshot = run / "snapshots" / "latest.safetensors"
+    for command in (
+        ["run", "--config", CONFIGS / "smoke.toml", "--run-dir", run, "--set", "run.episodes=60"],
+        ["evaluate", "--snapshot", snapshot, "--episodes", "2", "--record", recording],
+    ):
+        done = subprocess.run([program, *command], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    policy = skein_rl.Policy.load(snapshot, threads=1)
+    policy.to_onnx(tmp_path / "graph.onnx")
+    differences = differences_by_course(session_of(tmp_path / "graph.onnx"), recording)
+    assert sum(map(len, differences.values())) > 20
+    for of_course in differences.values():
+        assert max(of_course) < 1e-5
 
 
 def test_the_graph_says_what_it_is(policy, tmp_path):

@@ -1,14 +1,14 @@
 //! The agent: from camera image to action.
 
 use rand::{Rng, RngExt};
+use skein_inference::{ActionDistribution, Network, Scratch};
 use skein_protocol::config::ObservationLayout;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
 use skein_protocol::{ACTION, LatentCode};
-use skein_simulator::simulator::Simulator;
 
-use skein_inference::{ActionDistribution, Network, Scratch};
+use crate::world::World;
 
 /// Working memory of one thread that observes and acts.
 #[derive(Debug)]
@@ -35,19 +35,15 @@ impl Agent {
     /// Renders the camera image into `record` and encodes it there. `lap` is called after each.
     pub fn observe(
         &mut self,
-        simulator: &mut Simulator,
+        world: &mut impl World,
         network: &Network,
         record: &mut TransitionRecord,
         mut lap: impl FnMut(Stage),
     ) {
-        simulator.render(&mut record.depth);
+        world.render(&mut record.depth);
         lap(Stage::Camera);
         record.latent = network.encode(&record.depth, &mut self.scratch);
-        let state = simulator.state();
-        record.position_m = state.position_m.coords.into();
-        record.orientation = state.world_from_body.coords.into();
-        record.velocity_mps = state.velocity_mps.into();
-        record.ground_truth = simulator.ground_truth().numbers();
+        world.measure(record);
         lap(Stage::Encoder);
     }
 

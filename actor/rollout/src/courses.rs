@@ -195,8 +195,20 @@ impl Courses {
 
     /// Builds a simulator of the course that `ticket` names.
     fn build(&self, ticket: &Ticket) -> Result<Simulator, CourseChoiceError> {
+        let (course, settings) = self.course(ticket)?;
+        Ok(Simulator::new(course, settings)?)
+    }
+
+    /// Returns the course that `ticket` names, and the settings that it is flown with.
+    ///
+    /// # Errors
+    /// [`CourseChoiceError`] says what is wrong with the choice.
+    pub fn course(
+        &self,
+        ticket: &Ticket,
+    ) -> Result<(Arc<Course>, &SimulatorSettings), CourseChoiceError> {
         let choice = ticket.course;
-        let (course, settings) = match choice {
+        Ok(match choice {
             CourseChoice::Training => {
                 let course = self
                     .training
@@ -216,8 +228,7 @@ impl Courses {
                 let course = Course::generate_from_level(seed, level, ranges)?;
                 (Arc::new(course), &self.settings)
             }
-        };
-        Ok(Simulator::new(course, settings)?)
+        })
     }
 
     /// Returns the key of a one-off course; `None` for a course that is flown again and again.

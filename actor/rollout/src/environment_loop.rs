@@ -18,7 +18,7 @@ use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
 use skein_protocol::{ACTION, REWARD_TERM_NAMES};
-use skein_simulator::course::{Course, NoSuchLevel};
+use skein_simulator::course::NoSuchLevel;
 use skein_simulator::reward::{RewardSettings, RewardTerms};
 use skein_simulator::simulator::{
     EpisodeOutcome, LevelUp, Obstacle, SimulationError, Simulator, StepReport,
@@ -26,6 +26,7 @@ use skein_simulator::simulator::{
 
 use crate::agent::Agent;
 use crate::courses::{CourseChoiceError, Simulators};
+use crate::world::{World, Worlds};
 use skein_inference::Network;
 
 const _: () = assert!(
@@ -33,11 +34,11 @@ const _: () = assert!(
     "the terms of the simulator's reward are not REWARD_TERM_NAMES of skein-protocol: change these"
 );
 
-/// Flies tickets.
-pub struct EnvironmentLoop {
+/// Flies tickets in the worlds `W`.
+pub struct EnvironmentLoop<W = Simulators> {
     actor: ActorId,
     incarnation: ActorIncarnation,
-    simulators: Simulators,
+    worlds: W,
     reward: RewardSettings,
     agent: Agent,
     /// Teacher of tickets that ask for one; `None`: the oracle.
@@ -46,19 +47,14 @@ pub struct EnvironmentLoop {
     paused: Option<PausedEpisode>,
 }
 
-impl EnvironmentLoop {
+impl<W: Worlds> EnvironmentLoop<W> {
     /// Creates a loop that marks records with `actor` and `incarnation`.
-    pub fn new(
-        actor: ActorId,
-        incarnation: ActorIncarnation,
-        simulators: Simulators,
-        agent: Agent,
-    ) -> Self {
-        let reward = simulators.settings().reward.clone();
+    pub fn new(actor: ActorId, incarnation: ActorIncarnation, worlds: W, agent: Agent) -> Self {
+        let reward = worlds.reward_settings();
         Self {
             actor,
             incarnation,
-            simulators,
+            worlds,
             reward,
             agent,
             teacher: None,
@@ -101,14 +97,14 @@ impl EnvironmentLoop {
         };
 
         let mut record = begin(link, ticket.first_step())?;
-        let (simulator, mut flown) =
-            match position_at_start(&mut self.simulators, self.paused.take(), ticket) {
+        let (world, mut flown) =
+            match position_at_start(&mut self.worlds, self.paused.take(), ticket) {
                 Ok(start) => start,
                 Err(fault) => return Err(send_failure(fault, record, link)),
             };
         link.lap(Stage::Reset);
         self.agent
-            .observe(simulator, network, &mut record, |stage| link.lap(stage));
+            .observe(world, network, &mut record, |stage| link.lap(stage));
 
         let mut episode_return = 0.0;
         for step in ticket.first_step() + 1.. {
@@ -127,7 +123,10 @@ impl EnvironmentLoop {
                 Some(share) => {
                     record.teacher_action = match &mut self.teacher {
                         Some((policy, agent)) => agent.advise(policy, &record, &previous_action),
-                        None => simulator.oracle_action(),
+                        None => match world.oracle_action() {
+                            Ok(action) => action,
+                            Err(fault) => return Err(send_failure(fault, record, link)),
+                        },
                     };
                     match teacher_steps.random::<f32>() < share {
                         true => record.teacher_action,
@@ -137,17 +136,17 @@ impl EnvironmentLoop {
                 None => own_action,
             };
             link.lap(Stage::Policy);
-            let report = match simulator.step(action) {
+            let report = match world.step(action) {
                 Ok(report) => report,
-                Err(error) => return Err(send_failure(error.into(), record, link)),
+                Err(fault) => return Err(send_failure(fault, record, link)),
             };
             link.lap(Stage::Physics);
 
             // The reward depends on the next image, so that comes before this record is complete.
             let mut next = begin(link, step)?;
             self.agent
-                .observe(simulator, network, &mut next, |stage| link.lap(stage));
-            let reward = RewardTerms::of(&self.reward, &report, &next.depth);
+                .observe(world, network, &mut next, |stage| link.lap(stage));
+            let reward = world.reward(&self.reward, &report, &next.depth);
             complete(&mut record, action, &report, &reward);
             link.send(record).map_err(EpisodeError::Link)?;
 
@@ -159,7 +158,7 @@ impl EnvironmentLoop {
                     &mut record,
                     outcome(ended),
                     &report,
-                    simulator.course(),
+                    world.walls(),
                     episode_return,
                 );
                 link.send(record).map_err(EpisodeError::Link)?;
@@ -228,12 +227,17 @@ pub enum EpisodeError<E: std::error::Error + 'static> {
     /// The ticket or the physics is at fault. A record of kind [`RecordKind::Failed`] was sent.
     #[error("the episode failed: {0}")]
     Fault(#[source] EpisodeFault),
+    /// The actor's own environment is at fault. Nothing was sent of it: another actor can fly the
+    /// ticket.
+    #[error("the actor's environment failed: {0}")]
+    Foreign(String),
     /// Records cannot be sent.
     #[error("the episode's records cannot be sent: {0}")]
     Link(#[source] E),
 }
 
-/// Fault of an episode itself: it recurs for any actor that flies the ticket.
+/// Fault of an episode itself, which recurs for any actor that flies the ticket, or of a foreign
+/// environment.
 #[derive(Debug, thiserror::Error)]
 pub enum EpisodeFault {
     /// The ticket names an unknown course.
@@ -245,6 +249,9 @@ pub enum EpisodeFault {
     /// The simulation failed.
     #[error(transparent)]
     Simulation(#[from] SimulationError),
+    /// An environment that is not Skein's simulator failed.
+    #[error("{0}")]
+    Foreign(String),
     /// The earlier actions end the episode before the segment begins.
     #[error("the episode ends in step {step}, within the {prior_actions} steps before the segment")]
     EndedBefore {
@@ -287,30 +294,30 @@ impl PausedEpisode {
     }
 }
 
-/// Returns the simulator in the state in which `ticket` begins, and the actions that led there.
+/// Returns the world in the state in which `ticket` begins, and the actions that led there.
 /// The state is the reset or, for a later segment, the end of the previous one. If this loop does
 /// not hold that state, it repeats the actions, with the same result.
-fn position_at_start<'a>(
-    simulators: &'a mut Simulators,
+fn position_at_start<'a, W: Worlds>(
+    worlds: &'a mut W,
     paused: Option<PausedEpisode>,
     ticket: &Ticket,
-) -> Result<(&'a mut Simulator, Vec<[f32; ACTION]>), EpisodeFault> {
+) -> Result<(&'a mut W::World, Vec<[f32; ACTION]>), EpisodeFault> {
     let Some(segment) = &ticket.segment else {
-        return Ok((reset(simulators, ticket)?, Vec::new()));
+        return Ok((worlds.reset(ticket)?, Vec::new()));
     };
     if let Some(paused) = paused.filter(|paused| paused.is_before(ticket, segment)) {
-        return Ok((simulators.of(ticket)?, paused.flown));
+        return Ok((worlds.resume(ticket)?, paused.flown));
     }
-    let simulator = reset(simulators, ticket)?;
+    let world = worlds.reset(ticket)?;
     for (number, action) in (1..).zip(segment.prior_actions.iter()) {
-        if simulator.step(*action)?.outcome.is_some() {
+        if world.step(*action)?.outcome.is_some() {
             return Err(EpisodeFault::EndedBefore {
                 step: number,
                 prior_actions: segment.prior_actions.len(),
             });
         }
     }
-    Ok((simulator, segment.prior_actions.to_vec()))
+    Ok((world, segment.prior_actions.to_vec()))
 }
 
 fn is_last_of_segment(ticket: &Ticket, step: u32) -> bool {
@@ -379,18 +386,18 @@ fn close(
     record: &mut TransitionRecord,
     outcome: Outcome,
     report: &StepReport,
-    course: &Course,
+    walls: u8,
     episode_return: f64,
 ) -> EpisodeScore {
     let hit_wall = hit_wall(report);
     record.kind = RecordKind::Closing.code();
     record.walls_passed = report.walls_passed;
-    record.course_walls = course.levels();
+    record.course_walls = walls;
     record.outcome = outcome.code();
     record.hit_wall = hit_wall.unwrap_or(0);
     EpisodeScore {
         walls_passed: report.walls_passed.into(),
-        walls: course.levels().into(),
+        walls: walls.into(),
         // As in `episodes.csv`. For a segment, its rewards only.
         episode_return: f64::from(episode_return as f32),
         outcome,
@@ -406,12 +413,15 @@ fn hit_wall(report: &StepReport) -> Option<u8> {
     }
 }
 
-/// Sends `record` to report that the episode has failed.
+/// Sends `record` to report that the episode has failed, unless only this actor's environment has.
 fn send_failure<L: RecordLink>(
     fault: EpisodeFault,
     mut record: L::Loan,
     link: &mut L,
 ) -> EpisodeError<L::Error> {
+    if let EpisodeFault::Foreign(fault) = fault {
+        return EpisodeError::Foreign(fault);
+    }
     record.kind = RecordKind::Failed.code();
     match link.send(record) {
         Ok(()) => EpisodeError::Fault(fault),

@@ -259,7 +259,9 @@ impl Evaluation<'_> {
             }
             Err(EpisodeError::Link(never)) => match never {},
             Ok(None) => unreachable!("the ticket is for a whole episode"),
-            Err(EpisodeError::Abandoned) => unreachable!("an evaluation is never abandoned"),
+            Err(EpisodeError::Abandoned | EpisodeError::Foreign(_)) => {
+                unreachable!("an evaluation is never abandoned, nor flown elsewhere")
+            }
         }
     }
 }

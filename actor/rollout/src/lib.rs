@@ -12,3 +12,4 @@ pub mod evaluation;
 pub mod recording;
 #[cfg(test)]
 mod testing;
+pub mod world;

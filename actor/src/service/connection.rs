@@ -2,7 +2,6 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use skein_protocol::ids::{ActorId, ActorIncarnation};
@@ -30,7 +29,7 @@ pub(super) struct LearnerConnection<'a> {
     weights: SnapshotCache,
     tickets: VecDeque<QueuedTicket>,
     limits: ConnectionLimits,
-    exit_requested: &'a AtomicBool,
+    exit_requested: &'a dyn Fn() -> bool,
     /// Detected reason to disconnect.
     disconnect_reason: Option<DisconnectReason>,
     last_heard: Instant,
@@ -94,7 +93,7 @@ impl<'a> LearnerConnection<'a> {
     pub(super) fn disconnect_reason(&self) -> Option<DisconnectReason> {
         if self.disconnect_reason.is_some() {
             self.disconnect_reason
-        } else if self.exit_requested.load(Ordering::Relaxed) {
+        } else if (self.exit_requested)() {
             Some(DisconnectReason::Exit(ExitReason::Signalled))
         } else if self.last_heard.elapsed() > self.limits.learner_silence {
             Some(DisconnectReason::Exit(ExitReason::LearnerSilent))

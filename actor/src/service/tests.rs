@@ -58,6 +58,7 @@ impl Run {
             let agent = Agent::new(config.observation_layout());
             let mut environment_loop =
                 EnvironmentLoop::new(ACTOR, ActorIncarnation(0), Simulators::new(courses), agent);
+            let exit_requested = || exit_requested.load(Ordering::Relaxed);
             Service::new(&identity, &config, ACTOR, &exit_requested).serve(&mut environment_loop)
         }));
         started

@@ -4,6 +4,7 @@ use std::fs::OpenOptions;
 use std::path::Path;
 use std::sync::Mutex;
 
+use tracing::Subscriber;
 use tracing::level_filters::LevelFilter;
 use tracing_subscriber::filter::{ParseError, Targets};
 use tracing_subscriber::layer::SubscriberExt;
@@ -60,19 +61,8 @@ fn format_fault(wanted: Option<&str>) -> Option<String> {
 /// # Panics
 /// If called twice.
 pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
-    let file = OpenOptions::new().create(true).append(true).open(path)?;
-    // A full disk loses lines of the log and must not end the process.
-    let file = Mutex::new(BestEffort(file));
-    let (filter, fault) = filter(variable("RUST_LOG").as_deref());
-    let lines = fmt::layer().with_ansi(false).with_writer(file);
-    let lines = match format {
-        LogFormat::Text => lines.boxed(),
-        LogFormat::Json => lines.json().boxed(),
-    };
-    tracing_subscriber::registry()
-        .with(lines)
-        .with(filter)
-        .init();
+    let (subscriber, fault) = subscriber(path, format)?;
+    subscriber.init();
     if let Some(fault) = fault {
         tracing::warn!("{fault}");
     }
@@ -83,6 +73,42 @@ pub fn log_to_file(path: &Path, format: LogFormat) -> std::io::Result<()> {
         default_hook(panic);
     }));
     Ok(())
+}
+
+/// Appends what this thread logs during `work` to `path`: for a guest in another's process.
+///
+/// # Errors
+/// If the file cannot be opened.
+pub fn log_within<T>(
+    path: &Path,
+    format: LogFormat,
+    work: impl FnOnce() -> T,
+) -> std::io::Result<T> {
+    let (subscriber, fault) = subscriber(path, format)?;
+    Ok(tracing::subscriber::with_default(subscriber, || {
+        if let Some(fault) = fault {
+            tracing::warn!("{fault}");
+        }
+        work()
+    }))
+}
+
+/// Returns what writes to `path`, and what is wrong with `RUST_LOG`.
+fn subscriber(
+    path: &Path,
+    format: LogFormat,
+) -> std::io::Result<(impl Subscriber + Send + Sync + 'static, Option<String>)> {
+    let file = OpenOptions::new().create(true).append(true).open(path)?;
+    // A full disk loses lines of the log and must not end the process.
+    let file = Mutex::new(BestEffort(file));
+    let (filter, fault) = filter(variable("RUST_LOG").as_deref());
+    let lines = fmt::layer().with_ansi(false).with_writer(file);
+    let lines = match format {
+        LogFormat::Text => lines.boxed(),
+        LogFormat::Json => lines.json().boxed(),
+    };
+    let subscriber = tracing_subscriber::registry().with(lines).with(filter);
+    Ok((subscriber, fault))
 }
 
 /// Returns the filter in `RUST_LOG`, `info` if it is not set. If it is malformed, returns `info`
