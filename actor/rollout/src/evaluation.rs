@@ -18,7 +18,7 @@ use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
-use skein_protocol::transition::TransitionRecord;
+use skein_protocol::transition::{Outcome, TransitionRecord};
 
 use crate::agent::Agent;
 use crate::courses::{Courses, Simulators};
@@ -51,7 +51,10 @@ pub enum Keep {
     Scores,
     /// Also the positions in the first so many episodes of each entry, 12 bytes per step.
     Positions(u64),
-    /// Every record and position, 9.3 KiB per step.
+    /// Also all positions and, of episodes that did not reach the end wall, the last records: the
+    /// closing one and so many before it.
+    Failures(usize),
+    /// Every record and position, 9.3 KiB per step, with what the oracle would have done.
     Records,
 }
 
@@ -230,7 +233,8 @@ impl Evaluation<'_> {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
-            teacher_share: None,
+            // The oracle is asked for recordings alone, and never flies.
+            teacher_share: (self.keep == Keep::Records).then_some(0.0),
             segment: None,
         };
         let mut memory = MemoryLink {
@@ -246,7 +250,10 @@ impl Evaluation<'_> {
             Ok(Some(score)) => Ok(EvaluatedEpisode {
                 score,
                 positions_m: memory.positions_m,
-                records: memory.sent,
+                records: match (memory.keep, score.outcome) {
+                    (Keep::Failures(_), Outcome::ReachedEnd) => Vec::new(),
+                    _ => memory.sent,
+                },
             }),
             Err(EpisodeError::Fault(fault)) => {
                 let names = self.courses.evaluation().map(|entry| entry.name.clone());
@@ -289,6 +296,12 @@ impl RecordLink for MemoryLink {
         }
         match self.keep {
             Keep::Scores | Keep::Positions(_) => self.spare.push(record),
+            Keep::Failures(before_end) => {
+                self.sent.push(record);
+                if self.sent.len() > before_end + 1 {
+                    self.spare.push(self.sent.remove(0));
+                }
+            }
             Keep::Records => self.sent.push(record),
         }
         Ok(())
@@ -395,6 +408,20 @@ mod tests {
                 let kept = if number < 3 { recorded } else { Vec::new() };
                 assert_eq!((&some.positions_m, some.records.len()), (&kept, 0));
             }
+        }
+        let failures = evaluated(2, Keep::Failures(2));
+        assert_eq!(failures.report, records.report);
+        let of_both = failures.episodes.iter().zip(&records.episodes);
+        for (some, all) in of_both.flat_map(|(some, all)| some.iter().zip(all)) {
+            assert_eq!(some.positions_m, all.positions_m);
+            let last = match some.score.outcome {
+                Outcome::ReachedEnd => &[],
+                _ => &all.records[all.records.len().saturating_sub(3)..],
+            };
+            let steps = |records: &[Box<TransitionRecord>]| -> Vec<u32> {
+                records.iter().map(|record| record.step).collect()
+            };
+            assert_eq!(steps(&some.records), steps(last));
         }
         let starts: Vec<_> = records.episodes[0]
             .iter()

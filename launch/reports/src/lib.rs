@@ -8,6 +8,7 @@ pub mod comparison;
 mod complete_rows;
 mod courses;
 pub mod curves;
+pub mod failures;
 mod front_views;
 pub mod growth;
 mod head;
