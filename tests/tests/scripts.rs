@@ -74,6 +74,7 @@ fn every_help_says_in_the_same_words_that_wrong_arguments_end_with_status_2() {
         "experiment",
         "report",
         "encoder",
+        "watch",
     ];
     let helps = scripts()
         .into_iter()

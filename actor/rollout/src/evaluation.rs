@@ -117,7 +117,19 @@ impl Evaluation<'_> {
     /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be
     /// flown, or the thread that cannot be started.
     pub fn run(&self) -> Result<EvaluationResult, EvaluationError> {
-        let mut episodes = self.fly_all()?.into_iter();
+        self.run_and_tell(&|_| {})
+    }
+
+    /// As [`Evaluation::run`]; calls `tell` with the number of episodes flown, each time it grows,
+    /// from several threads.
+    ///
+    /// # Errors
+    /// As for [`Evaluation::run`].
+    pub fn run_and_tell(
+        &self,
+        tell: &(dyn Fn(u64) + Sync),
+    ) -> Result<EvaluationResult, EvaluationError> {
+        let mut episodes = self.fly_all(tell)?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
         for entry in self.courses.evaluation() {
@@ -144,18 +156,25 @@ impl Evaluation<'_> {
     }
 
     /// Flies all episodes; returns them in entry and episode order.
-    fn fly_all(&self) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
+    fn fly_all(
+        &self,
+        tell: &(dyn Fn(u64) + Sync),
+    ) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
         let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
-        let next = AtomicU64::new(0);
+        let counts = Counts {
+            next: AtomicU64::new(0),
+            flown: AtomicU64::new(0),
+            tell,
+        };
         let threads = self.threads();
         let mut flown: Vec<_> = std::thread::scope(|scope| {
             let start = |thread: usize| {
                 std::thread::Builder::new()
                     .name(format!("evaluation-{thread}"))
-                    .spawn_scoped(scope, || self.fly_next_until_done(&network, &next))
+                    .spawn_scoped(scope, || self.fly_next_until_done(&network, &counts))
                     .map_err(|source| {
                         // Running threads find no episode left.
-                        next.store(self.total(), Ordering::Relaxed);
+                        counts.next.store(self.total(), Ordering::Relaxed);
                         EvaluationError::Thread {
                             thread,
                             threads,
@@ -178,7 +197,7 @@ impl Evaluation<'_> {
     }
 
     /// Returns the number of episodes of all entries.
-    fn total(&self) -> u64 {
+    pub fn total(&self) -> u64 {
         self.courses.evaluation().map(|entry| entry.episodes).sum()
     }
 
@@ -193,12 +212,11 @@ impl Evaluation<'_> {
         None
     }
 
-    /// Work of one thread: flies the next episode until none is left. `next` counts episodes
-    /// through all entries.
+    /// Work of one thread: flies the next episode until none is left.
     fn fly_next_until_done(
         &self,
         network: &Network,
-        next: &AtomicU64,
+        counts: &Counts<'_>,
     ) -> Vec<(u64, Result<EvaluatedEpisode, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
         let agent = Agent::new(self.config.observation_layout());
@@ -206,7 +224,7 @@ impl Evaluation<'_> {
             EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {
-            let index = next.fetch_add(1, Ordering::Relaxed);
+            let index = counts.next.fetch_add(1, Ordering::Relaxed);
             let Some((entry, episode)) = self.entry_and_episode(index) else {
                 return flown;
             };
@@ -214,6 +232,7 @@ impl Evaluation<'_> {
                 index,
                 self.fly(&mut environment_loop, network, entry, episode),
             ));
+            (counts.tell)(counts.flown.fetch_add(1, Ordering::Relaxed) + 1);
         }
     }
 
@@ -269,6 +288,14 @@ impl Evaluation<'_> {
             Err(EpisodeError::Abandoned) => unreachable!("an evaluation is never abandoned"),
         }
     }
+}
+
+/// Episodes of all entries, counted by all threads.
+struct Counts<'a> {
+    /// The next one to fly.
+    next: AtomicU64,
+    flown: AtomicU64,
+    tell: &'a (dyn Fn(u64) + Sync),
 }
 
 /// Link that keeps records in plain memory.
@@ -353,6 +380,18 @@ mod tests {
         assert_eq!(threads(5, 3), 3);
         assert_eq!(threads(5, 100_000), 10);
         assert_eq!(threads(1_000_000, 100_000), MAX_THREADS);
+    }
+
+    #[test]
+    fn each_episode_that_was_flown_is_told_once() {
+        let told = std::sync::Mutex::new(Vec::new());
+        look_at(5, 3, Keep::Scores, |evaluation| {
+            let tell = |flown| told.lock().unwrap().push(flown);
+            evaluation.run_and_tell(&tell).unwrap()
+        });
+        let mut told = told.into_inner().unwrap();
+        told.sort_unstable();
+        assert_eq!(told, (1..=10).collect::<Vec<_>>());
     }
 
     #[test]

@@ -9,6 +9,7 @@ mod complete_rows;
 mod courses;
 pub mod curves;
 pub mod failures;
+pub mod flight;
 mod front_views;
 pub mod growth;
 mod head;

@@ -82,11 +82,11 @@ impl Failure {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
     /// Returns a course of two walls, a circle's and a triangle's, 10 m apart.
-    pub(super) fn course() -> Arc<Course> {
+    pub(crate) fn course() -> Arc<Course> {
         let text = "name = \"c\"\norder = [1, 2]\nwall_x_m = [10.0, 20.0]\n\
                     wall_thickness_m = 0.3\n\
                     corridor = { length_m = 30.0, width_m = 6.0, height_m = 7.0 }\n\
