@@ -94,8 +94,8 @@ pub struct Arguments {
     /// second before the end. What happened most often comes first.
     #[arg(long, value_name = "FILE")]
     failures: Option<PathBuf>,
-    /// Also draw the first episode to this file as it flies, as GIF: from above, from the side, what
-    /// its camera sees, and the latent code. Five times as fast as flown.
+    /// Also draw the first episode to this file as it flies, as GIF: from above, from the side,
+    /// its depth image, and the latent code. Five times as fast as flown.
     #[arg(long, value_name = "FILE")]
     gif: Option<PathBuf>,
     // Not a doc comment, which cannot contain the constant.

@@ -325,7 +325,8 @@ impl Film {
         self.last = now;
     }
 
-    /// Writes the film. An existing file is replaced atomically; if a link names it, the link stays.
+    /// Writes the film. An existing file is replaced atomically; if a link names it, the link
+    /// stays.
     fn save(mut self, path: &Path) -> Result<(), ReportError> {
         if let Some(last) = self.frames.last_mut() {
             last.delay = LAST_DELAY;

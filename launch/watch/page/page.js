@@ -338,7 +338,7 @@ async function flights() {
   const scene = {
     xaxis: axis("along, m", [0, length]), yaxis: axis("left, m", [-width / 2, width / 2]), zaxis: axis("up, m", [0, height]),
     aspectmode: "manual", aspectratio: { x: 2.6, y: 0.7, z: 0.7 * height / width },
-    camera: { eye: { x: -1.5, y: -2.3, z: 0.9 }, center: { x: -0.1, y: 0, z: -0.25 } },
+    camera: { eye: { x: -1.3, y: -2.0, z: 0.8 }, center: { x: -0.1, y: 0, z: -0.25 } },
   };
   return {
     nodes: [element("div", { class: "choices" }, choice, chosen, element("label", {}, "Step ", slider, where)), plot],

@@ -144,7 +144,7 @@ impl Catalogue {
         let last = last.into_iter().filter_map(changed).max()?;
         let id = path.strip_prefix(&self.root).ok()?.to_str()?.to_owned();
         let age = SystemTime::now().duration_since(last).unwrap_or_default();
-        let state = match (run.summary_json().exists(), age < QUIET) {
+        let state = match (is_complete(&run), age < QUIET) {
             (true, _) => State::Complete,
             (false, true) => State::Running,
             (false, false) => State::Stopped,
@@ -160,6 +160,14 @@ impl Catalogue {
     }
 }
 
+/// Returns `true` if a run has ended by itself. One that is lengthened has an older summary.
+fn is_complete(run: &RunDirectory) -> bool {
+    let changed = |path: PathBuf| fs::metadata(path).and_then(|file| file.modified()).ok();
+    let text = files::read_text(&run.summary_json(), REPORT_BYTES).unwrap_or_default();
+    let summary = serde_json::from_str::<serde_json::Value>(&text).unwrap_or_default();
+    summary["ending"] == "completed" && changed(run.summary_json()) >= changed(run.episodes_csv())
+}
+
 fn is_run(path: &Path) -> bool {
     path.join("config.toml").is_file()
 }
@@ -173,6 +181,24 @@ mod tests {
     fn run(folder: &Path, id: &str) {
         fs::create_dir_all(folder.join(id)).unwrap();
         fs::write(folder.join(id).join("config.toml"), "[run]\n").unwrap();
+    }
+
+    #[test]
+    fn a_run_is_complete_once_its_summary_says_so() {
+        let folder = tempfile::tempdir().unwrap();
+        run(folder.path(), "one");
+        let summary = folder.path().join("one/summary.json");
+        let state = |text: &str| {
+            fs::write(&summary, text).unwrap();
+            Catalogue::open(folder.path()).unwrap().runs()[0].state
+        };
+        assert_eq!(state("{\"ending\":\"completed\"}"), State::Complete);
+        assert_eq!(
+            state("{\"ending\":\"interrupted\"}"),
+            State::Running,
+            "just written"
+        );
+        assert_eq!(state("{"), State::Running);
     }
 
     #[test]

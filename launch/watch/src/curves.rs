@@ -22,7 +22,7 @@ const OF_EPISODES: [(&str, fn(&Episode) -> f64); 3] = [
     ("steps per episode", |row| f64::from(row.steps)),
 ];
 
-/// What has been read of a run.
+/// A run, as far as it has been read.
 #[derive(Debug, Default)]
 pub(crate) struct ReadRun {
     episodes: Episodes,
@@ -39,7 +39,7 @@ pub(crate) struct Curve {
     values: Vec<f64>,
 }
 
-/// What an actor has done.
+/// Episodes of an actor.
 #[derive(Debug, Default, Serialize)]
 pub(crate) struct Flown {
     episodes: u64,

@@ -8,7 +8,7 @@ use std::path::Path;
 /// Most bytes read at once, so that a long table needs no second copy in memory.
 const AT_ONCE: usize = 1 << 20;
 /// Bytes before the end of what was read that must not have changed: a resumed run cuts the table
-/// back and writes it anew.
+/// back and writes it again.
 const OVERLAP: usize = 64;
 
 /// An episode, as far as curves need it.
@@ -128,7 +128,7 @@ mod tests {
         "episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome\n";
 
     #[test]
-    fn a_table_is_read_as_it_grows_and_anew_when_it_was_cut_back() {
+    fn a_table_is_read_as_it_grows_and_again_when_it_was_cut_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("episodes.csv");
         let row = |number: usize, steps: u32| format!("{number},0,0,1,1,{steps},2,0.5,collided\n");
@@ -147,7 +147,7 @@ mod tests {
         assert_eq!(steps(&two), [7, 8]);
         assert_eq!(steps(&format!("{HEADER}{}", row(0, 7))), [7], "cut back");
         let other = format!("{HEADER}{}{}", row(0, 9), row(1, 8));
-        assert_eq!(steps(&other), [9, 8], "written anew");
+        assert_eq!(steps(&other), [9, 8], "written again");
         let damaged = format!("{other}\u{0}\n1,2\n{}", row(2, 3));
         assert_eq!(steps(&damaged), [9, 8, 3]);
         assert_eq!(episodes.damaged, 2);

@@ -65,7 +65,7 @@ pub(crate) async fn serve(listener: TcpListener, catalogue: Catalogue) -> anyhow
     }
 }
 
-/// What all requests share.
+/// State that all requests share.
 struct Shared {
     catalogue: Catalogue,
     runs: Mutex<HashMap<String, ReadRun>>,
@@ -287,7 +287,7 @@ impl Shared {
         look: impl FnOnce(&ReadRun) -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
         let run = self.find(id);
-        // A panic elsewhere leaves counts that the next update corrects or starts anew.
+        // A panic elsewhere leaves counts that the next update corrects or starts again.
         let mut runs = self.runs.lock().unwrap_or_else(PoisonError::into_inner);
         if run.is_err() {
             runs.remove(id);

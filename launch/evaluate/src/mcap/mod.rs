@@ -1,4 +1,4 @@
-//! Recordings of evaluation episodes as MCAP, with Foxglove's schemas: Foxglove and Rerun open them.
+//! Recordings of evaluation episodes as MCAP, with Foxglove's schemas, for Foxglove and Rerun.
 //!
 //! Episodes follow each other on one time axis. Each step has the numbers of the `.npz` recording,
 //! the depth image with its calibration, and the frames world, body and camera. Each episode begins
@@ -65,7 +65,7 @@ pub(crate) fn write(
 /// Topics of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Topic {
-    /// What the drone was, did and got: the arrays of the `.npz` recording but the image.
+    /// State, action and reward: the arrays of the `.npz` recording but the image.
     Step,
     /// The reward's terms by name.
     Reward,

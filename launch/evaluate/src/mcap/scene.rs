@@ -1,4 +1,4 @@
-//! What a viewer draws in 3-D: the corridor, its walls, the drone and its trail, and the frames.
+//! The scene that a viewer draws in 3-D: the corridor, its walls, the drone and its trail, and the frames.
 
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
@@ -87,8 +87,8 @@ pub(super) fn frames(
     ]
 }
 
-/// Returns the rotation of the camera in the body (i, j, k, w): a camera that looks forward, pitched
-/// up about the body's axis to the left.
+/// Returns the rotation of the camera in the body (i, j, k, w): a camera that looks forward,
+/// pitched up about the body's axis to the left.
 fn body_from_camera(camera: &CameraSettings) -> [f32; 4] {
     // Upwards is against the axis to the left.
     let (sin, cos) = (-camera.mount_pitch_deg.to_radians() / 2.0).sin_cos();
