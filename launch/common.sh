@@ -55,6 +55,11 @@ build_encoder() {
         --bin skein --bin skein-encoder
 }
 
+# Builds what the page needs: no libtorch, no learner.
+build_watch() {
+    cargo_build "building the page of skein watch (about 2 minutes on two cores the first time)" --bin skein-watch
+}
+
 # Builds every program.
 build() {
     "$repository/launch/setup.sh"

@@ -22,7 +22,7 @@ pub(crate) struct Cli {
 const SCRIPTS: &str = "\
 The scripts in launch/ build what a command needs and hand over to it: run_local.sh (run), \
 attach_actor.sh (attach), encoder.sh (encoder), evaluate.sh (evaluate), experiment.sh \
-(experiment), export.sh (export).";
+(experiment), export.sh (export), watch.sh (watch).";
 
 /// The commands; the text of each stands at its arguments.
 #[derive(Subcommand)]
@@ -39,6 +39,7 @@ pub(crate) enum Command {
     Export(ExportArguments),
     #[command(after_long_help = REPORT_NOTES)]
     Report(ReportArguments),
+    Watch(WatchArguments),
 }
 
 /// Trains on this machine: starts a learner and its actors, and watches them until the run ends.
@@ -134,6 +135,21 @@ Exit status: 0 the run ended, 1 failed, 2 wrong arguments, 130 interrupted.";
 #[command(disable_help_flag = true)]
 pub(crate) struct EncoderArguments {
     /// Options of skein-encoder.
+    #[arg(
+        value_name = "OPTIONS",
+        trailing_var_arg = true,
+        allow_hyphen_values = true
+    )]
+    pub(crate) options: Vec<OsString>,
+}
+
+/// Serves a page on this machine that shows what the runs of a folder are doing.
+///
+/// The program skein-watch does it, and has the options: skein watch --help.
+#[derive(Args)]
+#[command(disable_help_flag = true)]
+pub(crate) struct WatchArguments {
+    /// Options of skein-watch.
     #[arg(
         value_name = "OPTIONS",
         trailing_var_arg = true,

@@ -4,6 +4,7 @@
 mod cli;
 mod experiment;
 
+use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -87,6 +88,7 @@ fn carry_out() -> ExitCode {
                 .map_err(Into::into)
         }
         Command::Report(arguments) => report(&arguments),
+        Command::Watch(arguments) => hand_over("skein-watch", "watch.sh", &arguments.options),
     };
     match outcome {
         Ok(status) => status,
@@ -324,15 +326,18 @@ fn attach(arguments: &AttachArguments) -> anyhow::Result<Ended> {
 /// Becomes the program that trains encoders: it needs libtorch, which this one does without.
 fn encoder(arguments: &EncoderArguments) -> anyhow::Result<ExitCode> {
     check_library_space()?;
+    hand_over("skein-encoder", "encoder.sh", &arguments.options)
+}
+
+/// Replaces this program by `program`, which lies beside it and is built by `script`.
+fn hand_over(program: &str, script: &str, options: &[OsString]) -> anyhow::Result<ExitCode> {
     let program = std::env::current_exe()
         .context("cannot find where this program lies")?
-        .with_file_name("skein-encoder");
-    let error = process::Command::new(&program)
-        .args(&arguments.options)
-        .exec();
+        .with_file_name(program);
+    let error = process::Command::new(&program).args(options).exec();
     Err(error).with_context(|| {
         format!(
-            "cannot start {}: build it with launch/encoder.sh",
+            "cannot start {}: build it with launch/{script}",
             program.display()
         )
     })

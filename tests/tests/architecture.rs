@@ -210,6 +210,12 @@ fn every_package_has_only_its_allowed_dependencies() {
             ],
             &[torch, tokio],
         ),
+        // The page reads files: it can start, change and join nothing.
+        (
+            "skein-watch",
+            &["skein-protocol", "skein-run", "skein-simulator"],
+            &[torch, transport],
+        ),
         // An experiment starts `skein run`: it knows no supervisor.
         (
             "skein-experiments",

@@ -75,6 +75,7 @@ fn every_help_says_in_the_same_words_that_wrong_arguments_end_with_status_2() {
         "report",
         "export",
         "encoder",
+        "watch",
     ];
     let helps = scripts()
         .into_iter()

@@ -18,7 +18,7 @@ use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
-use skein_protocol::transition::TransitionRecord;
+use skein_protocol::transition::{Outcome, TransitionRecord};
 
 use crate::agent::Agent;
 use crate::courses::{Courses, Simulators};
@@ -51,7 +51,10 @@ pub enum Keep {
     Scores,
     /// Also the positions in the first so many episodes of each entry, 12 bytes per step.
     Positions(u64),
-    /// Every record and position, 9.3 KiB per step.
+    /// Also all positions and, of episodes that did not reach the end wall, the last records: the
+    /// closing one and so many before it.
+    Failures(usize),
+    /// Every record and position, 9.3 KiB per step, with what the oracle would have done.
     Records,
 }
 
@@ -114,7 +117,19 @@ impl Evaluation<'_> {
     /// [`EvaluationError`] names the first episode, in entry and episode order, that cannot be
     /// flown, or the thread that cannot be started.
     pub fn run(&self) -> Result<EvaluationResult, EvaluationError> {
-        let mut episodes = self.fly_all()?.into_iter();
+        self.run_and_tell(&|_| {})
+    }
+
+    /// As [`Evaluation::run`]; calls `tell` with the number of episodes flown, each time it grows,
+    /// from several threads.
+    ///
+    /// # Errors
+    /// As for [`Evaluation::run`].
+    pub fn run_and_tell(
+        &self,
+        tell: &(dyn Fn(u64) + Sync),
+    ) -> Result<EvaluationResult, EvaluationError> {
+        let mut episodes = self.fly_all(tell)?.into_iter();
         let mut courses = Vec::new();
         let mut by_course = Vec::new();
         for entry in self.courses.evaluation() {
@@ -141,18 +156,25 @@ impl Evaluation<'_> {
     }
 
     /// Flies all episodes; returns them in entry and episode order.
-    fn fly_all(&self) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
+    fn fly_all(
+        &self,
+        tell: &(dyn Fn(u64) + Sync),
+    ) -> Result<Vec<Result<EvaluatedEpisode, EvaluationError>>, EvaluationError> {
         let network = Network::new(self.snapshot, &SnapshotLayout::of(self.config));
-        let next = AtomicU64::new(0);
+        let counts = Counts {
+            next: AtomicU64::new(0),
+            flown: AtomicU64::new(0),
+            tell,
+        };
         let threads = self.threads();
         let mut flown: Vec<_> = std::thread::scope(|scope| {
             let start = |thread: usize| {
                 std::thread::Builder::new()
                     .name(format!("evaluation-{thread}"))
-                    .spawn_scoped(scope, || self.fly_next_until_done(&network, &next))
+                    .spawn_scoped(scope, || self.fly_next_until_done(&network, &counts))
                     .map_err(|source| {
                         // Running threads find no episode left.
-                        next.store(self.total(), Ordering::Relaxed);
+                        counts.next.store(self.total(), Ordering::Relaxed);
                         EvaluationError::Thread {
                             thread,
                             threads,
@@ -175,7 +197,7 @@ impl Evaluation<'_> {
     }
 
     /// Returns the number of episodes of all entries.
-    fn total(&self) -> u64 {
+    pub fn total(&self) -> u64 {
         self.courses.evaluation().map(|entry| entry.episodes).sum()
     }
 
@@ -190,12 +212,11 @@ impl Evaluation<'_> {
         None
     }
 
-    /// Work of one thread: flies the next episode until none is left. `next` counts episodes
-    /// through all entries.
+    /// Work of one thread: flies the next episode until none is left.
     fn fly_next_until_done(
         &self,
         network: &Network,
-        next: &AtomicU64,
+        counts: &Counts<'_>,
     ) -> Vec<(u64, Result<EvaluatedEpisode, EvaluationError>)> {
         let simulators = Simulators::new(Arc::clone(&self.courses));
         let agent = Agent::new(self.config.observation_layout());
@@ -203,7 +224,7 @@ impl Evaluation<'_> {
             EnvironmentLoop::new(ActorId(0), ActorIncarnation(0), simulators, agent);
         let mut flown = Vec::new();
         loop {
-            let index = next.fetch_add(1, Ordering::Relaxed);
+            let index = counts.next.fetch_add(1, Ordering::Relaxed);
             let Some((entry, episode)) = self.entry_and_episode(index) else {
                 return flown;
             };
@@ -211,6 +232,7 @@ impl Evaluation<'_> {
                 index,
                 self.fly(&mut environment_loop, network, entry, episode),
             ));
+            (counts.tell)(counts.flown.fetch_add(1, Ordering::Relaxed) + 1);
         }
     }
 
@@ -230,7 +252,8 @@ impl Evaluation<'_> {
             start_level: 1,
             exploration: Exploration::Mode,
             seed: derive(self.config.run.seed, Purpose::EvaluationEpisode, episode),
-            teacher_share: None,
+            // The oracle is asked for recordings alone, and never flies.
+            teacher_share: (self.keep == Keep::Records).then_some(0.0),
             segment: None,
         };
         let mut memory = MemoryLink {
@@ -246,7 +269,10 @@ impl Evaluation<'_> {
             Ok(Some(score)) => Ok(EvaluatedEpisode {
                 score,
                 positions_m: memory.positions_m,
-                records: memory.sent,
+                records: match (memory.keep, score.outcome) {
+                    (Keep::Failures(_), Outcome::ReachedEnd) => Vec::new(),
+                    _ => memory.sent,
+                },
             }),
             Err(EpisodeError::Fault(fault)) => {
                 let names = self.courses.evaluation().map(|entry| entry.name.clone());
@@ -264,6 +290,14 @@ impl Evaluation<'_> {
             }
         }
     }
+}
+
+/// Episodes of all entries, counted by all threads.
+struct Counts<'a> {
+    /// The next one to fly.
+    next: AtomicU64,
+    flown: AtomicU64,
+    tell: &'a (dyn Fn(u64) + Sync),
 }
 
 /// Link that keeps records in plain memory.
@@ -291,6 +325,12 @@ impl RecordLink for MemoryLink {
         }
         match self.keep {
             Keep::Scores | Keep::Positions(_) => self.spare.push(record),
+            Keep::Failures(before_end) => {
+                self.sent.push(record);
+                if self.sent.len() > before_end + 1 {
+                    self.spare.push(self.sent.remove(0));
+                }
+            }
             Keep::Records => self.sent.push(record),
         }
         Ok(())
@@ -342,6 +382,18 @@ mod tests {
         assert_eq!(threads(5, 3), 3);
         assert_eq!(threads(5, 100_000), 10);
         assert_eq!(threads(1_000_000, 100_000), MAX_THREADS);
+    }
+
+    #[test]
+    fn each_episode_that_was_flown_is_told_once() {
+        let told = std::sync::Mutex::new(Vec::new());
+        look_at(5, 3, Keep::Scores, |evaluation| {
+            let tell = |flown| told.lock().unwrap().push(flown);
+            evaluation.run_and_tell(&tell).unwrap()
+        });
+        let mut told = told.into_inner().unwrap();
+        told.sort_unstable();
+        assert_eq!(told, (1..=10).collect::<Vec<_>>());
     }
 
     #[test]
@@ -397,6 +449,20 @@ mod tests {
                 let kept = if number < 3 { recorded } else { Vec::new() };
                 assert_eq!((&some.positions_m, some.records.len()), (&kept, 0));
             }
+        }
+        let failures = evaluated(2, Keep::Failures(2));
+        assert_eq!(failures.report, records.report);
+        let of_both = failures.episodes.iter().zip(&records.episodes);
+        for (some, all) in of_both.flat_map(|(some, all)| some.iter().zip(all)) {
+            assert_eq!(some.positions_m, all.positions_m);
+            let last = match some.score.outcome {
+                Outcome::ReachedEnd => &[],
+                _ => &all.records[all.records.len().saturating_sub(3)..],
+            };
+            let steps = |records: &[Box<TransitionRecord>]| -> Vec<u32> {
+                records.iter().map(|record| record.step).collect()
+            };
+            assert_eq!(steps(&some.records), steps(last));
         }
         let starts: Vec<_> = records.episodes[0]
             .iter()

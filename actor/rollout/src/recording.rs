@@ -31,7 +31,7 @@ pub struct Column {
     pub shape: &'static [AxisLength],
     /// Meaning.
     pub meaning: &'static str,
-    write: fn(&RecordingRow<'_>, &mut Vec<u8>),
+    write_value: fn(&RecordingRow<'_>, &mut Vec<u8>),
 }
 
 /// Length of an axis of an array.
@@ -62,16 +62,20 @@ impl fmt::Display for AxisLength {
 }
 
 /// One observation of a recording.
-struct RecordingRow<'a> {
-    course: i32,
-    episode: i32,
+#[derive(Debug, Clone, Copy)]
+pub struct RecordingRow<'a> {
+    /// Number of the course.
+    pub course: i32,
+    /// Number of the episode on that course.
+    pub episode: i32,
     /// Length of the latent code.
-    latent: usize,
-    record: &'a TransitionRecord,
+    pub latent: usize,
+    /// The observation.
+    pub record: &'a TransitionRecord,
 }
 
 /// All arrays with one row per observation. [`NAME_LISTS`] are written in addition.
-pub const COLUMNS: [Column; 15] = [
+pub const COLUMNS: [Column; 16] = [
     Column::new(
         "course",
         "<i4",
@@ -155,6 +159,15 @@ pub const COLUMNS: [Column; 15] = [
         },
     ),
     Column::new(
+        "oracle_action",
+        "<f4",
+        &[Fixed(ACTION)],
+        "what the oracle would have commanded; 0 in closing rows",
+        |row, out| {
+            put(out, &row.record.teacher_action);
+        },
+    ),
+    Column::new(
         "reward_terms",
         "<f4",
         &[Fixed(REWARD_TERMS)],
@@ -211,15 +224,20 @@ impl Column {
         kind: &'static str,
         shape: &'static [AxisLength],
         meaning: &'static str,
-        write: fn(&RecordingRow<'_>, &mut Vec<u8>),
+        write_value: fn(&RecordingRow<'_>, &mut Vec<u8>),
     ) -> Self {
         Self {
             name,
             kind,
             shape,
             meaning,
-            write,
+            write_value,
         }
+    }
+
+    /// Appends the value of `row` to `out`, in memory order.
+    pub fn write(&self, row: &RecordingRow<'_>, out: &mut Vec<u8>) {
+        (self.write_value)(row, out);
     }
 }
 
@@ -245,10 +263,21 @@ pub fn write_recording(
     latent: usize,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
+    write_atomically(path, |file| write_npz(file, courses, latent, episodes))
+}
+
+/// Writes the recording `path` with `write`, under another name until it is complete.
+///
+/// # Errors
+/// [`RecordingError`] names the file.
+pub fn write_atomically(
+    path: &Path,
+    write: impl FnOnce(&Path) -> io::Result<()>,
+) -> Result<(), RecordingError> {
     // A link stays a link: the recording goes where it leads.
     let target = destination(path).unwrap_or_else(|| path.to_owned());
     let temporary = temporary_path(&target);
-    write_npz(&temporary, courses, latent, episodes)
+    write(&temporary)
         .and_then(|()| fs::rename(&temporary, &target))
         .map_err(|source| {
             // A partial recording is useless. If there is none, removing it does nothing.
@@ -276,7 +305,10 @@ pub fn check_recordable(path: &Path) -> Result<(), RecordingError> {
 
 /// Returns the temporary path of a recording.
 pub fn temporary_path(path: &Path) -> PathBuf {
-    path.with_extension("npz.tmp")
+    path.with_extension(match path.extension() {
+        Some(extension) if extension == "mcap" => "mcap.tmp",
+        _ => "npz.tmp",
+    })
 }
 
 fn failed(path: &Path, source: io::Error) -> RecordingError {
@@ -303,7 +335,7 @@ fn write_npz(
         let mut bytes = Vec::new();
         for row in &rows {
             bytes.clear();
-            (column.write)(row, &mut bytes);
+            column.write(row, &mut bytes);
             zip.write_all(&bytes)?;
         }
     }

@@ -2,8 +2,12 @@
 //!
 //! `skein-evaluate` and `skein evaluate` share this module.
 
+mod failures;
+mod film;
+mod mcap;
 mod memory;
 mod plot;
+mod progress;
 mod settings;
 
 use std::fs::{self, File, OpenOptions};
@@ -13,6 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::memory::{check_recording, free_memory};
+use crate::progress::Progress;
 use crate::settings::{Flown, with_overrides};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
@@ -24,9 +29,10 @@ use skein_protocol::files::destination;
 use skein_protocol::snapshot::Snapshot;
 use skein_reports::{MOST_DRAWN, unfinished_picture};
 use skein_rollout::courses::Courses;
-use skein_rollout::evaluation::{Evaluation, Keep, MAX_THREADS};
+use skein_rollout::evaluation::{EvaluatedEpisode, Evaluation, Keep, MAX_THREADS};
 use skein_rollout::recording::{
-    COLUMNS, NAME_LISTS, check_recordable, temporary_path, write_recording,
+    COLUMNS, NAME_LISTS, RecordingError, check_recordable, temporary_path, write_atomically,
+    write_recording,
 };
 use skein_run::RunDirectory;
 use skein_run::tables::evaluation_table;
@@ -71,14 +77,27 @@ pub struct Arguments {
     /// Also write the result to this file, as JSON.
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Also write every step of every episode to this file, as .npz. Needs 9.3 KiB of memory per
-    /// step, about 1 MiB per whole episode.
+    /// Also write every step of every episode to this file. Needs 9.3 KiB of memory per step, about
+    /// 1 MiB per whole episode.
+    ///
+    /// A file FILE.mcap is one that Foxglove and Rerun open; any other is an .npz, for NumPy.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Also draw the trajectories to this file, as PNG: each course from above and from the side,
     /// and its walls from the front. Of an entry with several courses, the first is drawn.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
+    /// Also draw the episodes that failed to this file, as PNG, and print how the approaches to the
+    /// walls ended: by shape of the opening, its clearance and its offset.
+    ///
+    /// The picture shows the wall with its opening, the last two metres, and the depth image a
+    /// second before the end. What happened most often comes first.
+    #[arg(long, value_name = "FILE")]
+    failures: Option<PathBuf>,
+    /// Also draw the first episode to this file as it flies, as GIF: from above, from the side,
+    /// its depth image, and the latent code. Five times as fast as flown.
+    #[arg(long, value_name = "FILE")]
+    gif: Option<PathBuf>,
     // Not a doc comment, which cannot contain the constant.
     #[arg(long, value_name = "N", help = threads_help())]
     threads: Option<NonZeroUsize>,
@@ -111,7 +130,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_folder(file)?;
         check_recordable(file)?;
     }
-    if let Some(file) = &arguments.plot {
+    let pictures = [&arguments.plot, &arguments.failures, &arguments.gif];
+    for file in pictures.into_iter().flatten() {
         check_plottable(file)?;
     }
     let (snapshot, trained) = Snapshot::load(&path)?;
@@ -143,10 +163,15 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .threads
         .map_or_else(std::thread::available_parallelism, Ok)
         .unwrap_or(NonZeroUsize::MIN);
-    let keep = match (&arguments.record, &arguments.plot) {
-        (Some(_), _) => Keep::Records,
-        (None, Some(_)) => Keep::Positions(MOST_DRAWN as u64),
-        (None, None) => Keep::Scores,
+    let keep = match arguments {
+        Arguments {
+            record: Some(_), ..
+        } => Keep::Records,
+        Arguments {
+            failures: Some(_), ..
+        } => failures::to_keep(courses.settings()),
+        Arguments { plot: Some(_), .. } => Keep::Positions(MOST_DRAWN as u64),
+        _ => Keep::Scores,
     };
     let evaluation = Evaluation {
         snapshot: &snapshot,
@@ -182,7 +207,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for note in shapes_trained_on(&config, &courses) {
         note!("{note}");
     }
-    let evaluated = evaluation.run()?;
+    let progress = Progress::new(evaluation.total());
+    let evaluated = evaluation.run_and_tell(&|flown| progress.tell(flown));
+    progress.finish();
+    let evaluated = evaluated?;
 
     // Files first: the terminal may be gone. A file that cannot be written costs no other result.
     let json = arguments.json.as_deref();
@@ -194,23 +222,52 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         write_json(file, &report)
     });
     let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
-        let names: Vec<_> = courses
-            .evaluation()
-            .map(|entry| entry.name.as_str())
-            .collect();
-        write_recording(file, &names, config.vae.latent, &evaluated.episodes)
+        record(file, &courses, config.vae.latent, &evaluated.episodes)
     });
     let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
         plot::draw(&courses, &evaluated.episodes, file)
+    });
+    let failures = arguments
+        .failures
+        .as_ref()
+        .map(|file| failures::draw(&courses, &evaluated.episodes, file, stdout_columns()));
+    let filmed = arguments.gif.as_ref().map_or(Ok(()), |file| {
+        let again = self::courses(arguments, &config, &path)?.with_episodes(1);
+        film::draw(&snapshot, &config, again, file)
     });
     show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
     written?;
     recorded?;
     drawn?;
-    if let Some(file) = &arguments.plot {
-        note!("plot: {}", file.display());
+    filmed?;
+    if let Some(approaches) = failures {
+        show!("{}", approaches?);
+    }
+    for (what, file) in ["plot", "failures", "gif"].into_iter().zip(pictures) {
+        if let Some(file) = file {
+            note!("{what}: {}", file.display());
+        }
     }
     Ok(())
+}
+
+/// Writes a recording in the format that the file's name asks for.
+fn record(
+    file: &Path,
+    courses: &Courses,
+    latent: usize,
+    episodes: &[Vec<EvaluatedEpisode>],
+) -> Result<(), RecordingError> {
+    match file.extension() {
+        Some(extension) if extension == "mcap" => {
+            write_atomically(file, |file| mcap::write(file, courses, latent, episodes))
+        }
+        _ => {
+            let entries = courses.evaluation();
+            let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
+            write_recording(file, &names, latent, episodes)
+        }
+    }
 }
 
 fn write_json(file: &Path, report: &WrittenReport<'_>) -> anyhow::Result<()> {
@@ -246,6 +303,8 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
         ("--json", arguments.json.clone()),
         ("--record", arguments.record.clone()),
         ("--plot", arguments.plot.clone()),
+        ("--failures", arguments.failures.clone()),
+        ("--gif", arguments.gif.clone()),
         (
             "the unfinished file of --record",
             arguments.record.as_deref().map(temporary_path),
@@ -253,6 +312,14 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
         (
             "the unfinished file of --plot",
             arguments.plot.as_deref().map(unfinished_picture),
+        ),
+        (
+            "the unfinished file of --failures",
+            arguments.failures.as_deref().map(unfinished_picture),
+        ),
+        (
+            "the unfinished file of --gif",
+            arguments.gif.as_deref().map(unfinished_picture),
         ),
     ];
     let outputs: Vec<_> = outputs
@@ -470,7 +537,7 @@ fn columns_help() -> String {
         .map(|(name, kind, shape, meaning)| format!("  {name:<17} {kind:<4} {shape:<14} {meaning}"))
         .collect();
     format!(
-        "Arrays in the file of --record, read by numpy.load(FILE); one row per observation, \
+        "Arrays in the .npz file of --record, read by numpy.load(FILE); one row per observation, \
         episodes and courses in order:\n{}\n\n\
         Exit status: 0 flown, 1 failed, 2 wrong arguments.",
         lines.join("\n")

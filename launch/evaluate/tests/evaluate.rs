@@ -5,6 +5,7 @@
     reason = "a test's helpers fail by panicking, as tests do"
 )]
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -109,6 +110,20 @@ fn a_run_is_evaluated_on_its_own_courses_with_the_same_result_on_any_number_of_t
 }
 
 #[test]
+fn failed_episodes_are_drawn_and_their_approaches_counted() {
+    let folder = run_folder();
+    let arguments = ["--run", ".", "--episodes", "3", "--failures", "why.png"];
+    let output = evaluate(folder.path(), &arguments);
+    assert!(output.status.success(), "{output:?}");
+    let picture = std::fs::read(folder.path().join("why.png")).unwrap();
+    assert!(picture.starts_with(b"\x89PNG") && picture.ends_with(b"IEND\xaeB`\x82"));
+    let printed = String::from_utf8(output.stdout).unwrap();
+    let rows = |of: &str| printed.lines().filter(|line| line.contains(of)).count();
+    assert!(rows("shape: ") > 0 && rows("clearance: ") > 0, "{printed}");
+    assert!(rows("offset: ") > 0, "{printed}");
+}
+
+#[test]
 fn a_snapshot_file_alone_is_flown_and_recorded() {
     let folder = run_folder();
     let course = shipped("rearranged_34125.toml");
@@ -129,6 +144,74 @@ fn a_snapshot_file_alone_is_flown_and_recorded() {
     let recording = std::fs::File::open(folder.path().join("episodes.npz")).unwrap();
     let mut arrays = zip::ZipArchive::new(recording).unwrap();
     assert!(arrays.by_name("depth.npy").is_ok());
+}
+
+/// Returns the data of an array of a recording.
+fn array(recording: &Path, name: &str) -> Vec<u8> {
+    let mut arrays = zip::ZipArchive::new(std::fs::File::open(recording).unwrap()).unwrap();
+    let mut bytes = Vec::new();
+    let mut array = arrays.by_name(&format!("{name}.npy")).unwrap();
+    array.read_to_end(&mut bytes).unwrap();
+    let header = 10 + usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
+    bytes.split_off(header)
+}
+
+#[test]
+fn an_mcap_recording_has_every_observation_of_the_npz_with_its_image_and_its_numbers() {
+    let folder = run_folder();
+    for record in ["episodes.npz", "episodes.mcap"] {
+        let arguments = ["--run", ".", "--episodes", "2", "--record", record];
+        let output = evaluate(folder.path(), &arguments);
+        assert!(output.status.success(), "{output:?}");
+    }
+    let at = |name: &str| folder.path().join(name);
+    assert!(!at("episodes.mcap.tmp").exists());
+    let recording = std::fs::read(at("episodes.mcap")).unwrap();
+    let messages: Vec<_> = mcap::MessageStream::new(&recording)
+        .unwrap()
+        .collect::<Result<_, _>>()
+        .unwrap();
+    let of = |topic: &str| -> Vec<&mcap::Message<'_>> {
+        let of_topic = |message: &&mcap::Message<'_>| message.channel.topic == topic;
+        messages.iter().filter(of_topic).collect()
+    };
+    let images = array(&at("episodes.npz"), "depth");
+    let images = images.chunks_exact(72 * 128);
+    let seen = of("/camera/image");
+    assert_eq!(seen.len(), images.len());
+    for (message, image) in seen.iter().zip(images) {
+        let mut places = message.data.windows(image.len());
+        assert!(places.any(|place| place == image), "an image differs");
+    }
+    let oracle = array(&at("episodes.npz"), "oracle_action");
+    assert!(oracle.iter().any(|&byte| byte != 0), "the oracle was asked");
+    for name in [
+        "position_m",
+        "latent",
+        "action",
+        "oracle_action",
+        "reward_terms",
+    ] {
+        let values = array(&at("episodes.npz"), name);
+        let steps = of("/drone/step");
+        let rows = values.chunks_exact(values.len() / steps.len());
+        for (message, row) in steps.iter().zip(rows) {
+            let mut places = message.data.windows(row.len());
+            assert!(places.any(|place| place == row), "{name} differs");
+        }
+    }
+    for topic in [
+        "/frames",
+        "/camera/calibration",
+        "/camera/depth",
+        "/drone/reward",
+    ] {
+        assert_eq!(of(topic).len(), seen.len(), "{topic}");
+    }
+    assert!(
+        of("/events").len() >= 8,
+        "each of four episodes begins and ends"
+    );
 }
 
 #[test]

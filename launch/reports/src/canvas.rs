@@ -44,6 +44,7 @@ pub(super) fn font(pixels: u32) -> TextStyle<'static> {
 }
 
 /// RGB picture, initially white.
+#[derive(Clone)]
 pub(super) struct Canvas {
     width: u32,
     height: u32,
@@ -150,7 +151,7 @@ impl Canvas {
     }
 
     /// Returns the picture at its final size, each pixel the mean of the drawn ones.
-    fn averaged(&self) -> Vec<u8> {
+    pub(super) fn averaged(&self) -> Vec<u8> {
         let stride = px(self.width) as usize;
         let scale = SCALE as usize;
         let mut small = Vec::with_capacity((self.width * self.height * 3) as usize);
@@ -171,10 +172,14 @@ impl Canvas {
 
 /// Returns the name under which the picture at `path` is written; links are followed.
 pub fn unfinished_picture(path: &Path) -> PathBuf {
-    target(path).with_extension("png.partial")
+    target(path).with_extension(match path.extension() {
+        Some(extension) if extension == "gif" => "gif.partial",
+        _ => "png.partial",
+    })
 }
 
-fn target(path: &Path) -> PathBuf {
+/// Returns where a picture goes: links are followed.
+pub(super) fn target(path: &Path) -> PathBuf {
     destination(path).unwrap_or_else(|| path.to_owned())
 }
 

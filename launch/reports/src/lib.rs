@@ -8,6 +8,8 @@ pub mod comparison;
 mod complete_rows;
 mod courses;
 pub mod curves;
+pub mod failures;
+pub mod flight;
 mod front_views;
 pub mod growth;
 mod head;

@@ -222,22 +222,7 @@ impl ViewedFrom {
     /// Returns the parts of a wall that are open in a cut through the safe point of its opening:
     /// a horizontal cut for the view from above, a vertical one for the view from the side.
     fn open_in_cut_m(self, wall: &Wall) -> Vec<(f32, f32)> {
-        let (across, along) = (self.axis(), 1 - self.axis());
-        let cut_m = wall.safe_point()[along];
-        let outline = wall.outline();
-        let mut ends: Vec<f32> = outline
-            .iter()
-            .zip(outline.iter().cycle().skip(1))
-            .filter(|(from, to)| (from[along] > cut_m) != (to[along] > cut_m))
-            .map(|(from, to)| {
-                let share = (cut_m - from[along]) / (to[along] - from[along]);
-                from[across] + share * (to[across] - from[across])
-            })
-            .collect();
-        ends.sort_by(f32::total_cmp);
-        ends.chunks_exact(2)
-            .map(|pair| (pair[0], pair[1]))
-            .collect()
+        open_in_cut_m(wall, self.axis(), wall.safe_point()[1 - self.axis()])
     }
 
     /// Returns the range over which a wall is open in any cut.
@@ -256,6 +241,26 @@ impl ViewedFrom {
             Self::Side => "from the side: z, m",
         }
     }
+}
+
+/// Returns the parts of a wall that are open along axis `across` (0: y, 1: z), in a cut at `cut_m`
+/// on the other axis.
+pub(super) fn open_in_cut_m(wall: &Wall, across: usize, cut_m: f32) -> Vec<(f32, f32)> {
+    let along = 1 - across;
+    let outline = wall.outline();
+    let mut ends: Vec<f32> = outline
+        .iter()
+        .zip(outline.iter().cycle().skip(1))
+        .filter(|(from, to)| (from[along] > cut_m) != (to[along] > cut_m))
+        .map(|(from, to)| {
+            let share = (cut_m - from[along]) / (to[along] - from[along]);
+            from[across] + share * (to[across] - from[across])
+        })
+        .collect();
+    ends.sort_by(f32::total_cmp);
+    ends.chunks_exact(2)
+        .map(|pair| (pair[0], pair[1]))
+        .collect()
 }
 
 /// Position of one panel in drawn pixels.
@@ -389,7 +394,7 @@ pub(super) fn opacity_of(outcome: Outcome, episodes: usize) -> f64 {
     }
 }
 
-fn plural(count: usize, what: &str) -> String {
+pub(super) fn plural(count: usize, what: &str) -> String {
     match count {
         1 => format!("1 {what}"),
         count => format!("{count} {what}s"),

@@ -70,6 +70,21 @@ fn grid(shown: &[TableColumn], report: &EvaluationReport) -> Table {
     table
 }
 
+/// Returns rows of cells below `titles` as a table of at most `columns`. The first column is text,
+/// the others are numbers.
+pub fn rates_table(titles: &[&str], rows: &[Vec<String>], columns: usize) -> String {
+    let mut table = Table::new();
+    table.load_preset(UTF8_FULL_CONDENSED);
+    table.set_header(titles);
+    for row in rows {
+        table.add_row(row);
+    }
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+    fit(table, columns)
+}
+
 /// Returns the text of `table` in at most `columns`: cells are broken into lines where it is wider.
 /// Where even its rules do not fit, each cell is a line `title: cell`.
 pub fn fit(mut table: Table, columns: usize) -> String {

@@ -92,7 +92,8 @@ impl CameraSettings {
 
     /// Returns the focal length in pixels: a point at `(right, down, forward)` falls `focal * right
     /// / forward` pixels to the right of the image's middle.
-    pub(super) fn focal_px(&self) -> f32 {
+    #[must_use]
+    pub fn focal_px(&self) -> f32 {
         IMAGE_WIDTH as f32 / 2.0 / (self.horizontal_fov_deg.to_radians() / 2.0).tan()
     }
 

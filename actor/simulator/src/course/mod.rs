@@ -305,6 +305,21 @@ impl Course {
         ))
     }
 
+    /// Returns the triangles of each wall, by wall in course order: corners in the world frame,
+    /// metres, counter-clockwise seen from the free side.
+    #[must_use]
+    pub fn wall_triangles(&self) -> Vec<Vec<[[f32; 3]; 3]>> {
+        let mesh = self.mesh();
+        let mut walls = vec![Vec::new(); self.walls.len()];
+        for (triangle, surface) in mesh.triangles() {
+            if let SurfaceKind::Wall(place) = mesh.surfaces[surface].kind {
+                let corner = |vertex: u32| mesh.vertices[vertex as usize].coords.into();
+                walls[place].push(triangle.map(corner));
+            }
+        }
+        walls
+    }
+
     /// Returns all surfaces of the course, seen from the inside.
     pub(crate) fn mesh(&self) -> Mesh {
         Mesh::of(self)

@@ -1,0 +1,263 @@
+//! Recordings of evaluation episodes as MCAP, with Foxglove's schemas, for Foxglove and Rerun.
+//!
+//! Episodes follow each other on one time axis. Each step has the numbers of the `.npz` recording,
+//! the depth image with its calibration, and the frames world, body and camera. Each episode begins
+//! with its walls and the drone as a scene. File format: <https://mcap.dev/spec>.
+
+mod messages;
+mod scene;
+mod schemas;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::path::Path;
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, WriteOptions, Writer};
+use prost::Message;
+use skein_protocol::REWARD_TERM_NAMES;
+use skein_protocol::transition::{Outcome, TransitionRecord};
+use skein_rollout::courses::Courses;
+use skein_rollout::evaluation::EvaluatedEpisode;
+use skein_rollout::recording::RecordingRow;
+use skein_simulator::course::Course;
+use skein_simulator::simulator::SimulatorSettings;
+
+use messages::{CameraCalibration, FrameTransforms, Level, Log, RawImage, Timestamp};
+use schemas::{Schema, encode_reward, encode_step};
+
+/// Pause between two episodes on the time axis, seconds.
+const PAUSE_SECS: f64 = 1.0;
+
+/// Writes `episodes`, entry by entry, to `path`. `latent` is the length of their codes.
+///
+/// # Errors
+/// Of the file, or if a course cannot be generated again.
+pub(crate) fn write(
+    path: &Path,
+    courses: &Courses,
+    latent: usize,
+    episodes: &[Vec<EvaluatedEpisode>],
+) -> io::Result<()> {
+    let mut recording = Recording::create(path, courses.settings())?;
+    recording.write_names(courses)?;
+    for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
+        for (number, episode) in (0..).zip(episodes) {
+            let course = entry.courses.of_episode(number);
+            let course = course.map_err(io::Error::other)?;
+            let title = format!("{}, episode {number}", entry.name);
+            recording.begin_episode(&title, &course)?;
+            for record in &episode.records {
+                recording.write_step(&RecordingRow {
+                    course: entry_number,
+                    episode: number as i32,
+                    latent,
+                    record,
+                })?;
+            }
+            recording.end_episode(episode)?;
+        }
+    }
+    recording.finish()
+}
+
+/// Topics of a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Topic {
+    /// State, action and reward: the arrays of the `.npz` recording but the image.
+    Step,
+    /// The reward's terms by name.
+    Reward,
+    /// The depth image's bytes, as the encoder sees them.
+    Image,
+    /// The same in millimetres.
+    Depth,
+    Calibration,
+    Frames,
+    Scene,
+    Events,
+}
+
+impl Topic {
+    const ALL: [Self; 8] = [
+        Self::Step,
+        Self::Reward,
+        Self::Image,
+        Self::Depth,
+        Self::Calibration,
+        Self::Frames,
+        Self::Scene,
+        Self::Events,
+    ];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Step => "/drone/step",
+            Self::Reward => "/drone/reward",
+            Self::Image => "/camera/image",
+            Self::Depth => "/camera/depth",
+            Self::Calibration => "/camera/calibration",
+            Self::Frames => "/frames",
+            Self::Scene => "/scene",
+            Self::Events => "/events",
+        }
+    }
+
+    fn schema(self) -> Schema {
+        match self {
+            Self::Step => schemas::step(),
+            Self::Reward => schemas::reward(),
+            Self::Image | Self::Depth => schemas::RAW_IMAGE,
+            Self::Calibration => schemas::CAMERA_CALIBRATION,
+            Self::Frames => schemas::FRAME_TRANSFORMS,
+            Self::Scene => schemas::SCENE_UPDATE,
+            Self::Events => schemas::LOG,
+        }
+    }
+}
+
+/// An MCAP file under way.
+struct Recording<'a> {
+    settings: &'a SimulatorSettings,
+    writer: Writer<BufWriter<File>>,
+    /// Number of each topic of [`Topic::ALL`] in the file.
+    channels: Vec<u16>,
+    /// Messages so far.
+    sequence: u32,
+    /// Beginning of the present episode on the time axis, seconds.
+    begin_secs: f64,
+    /// Time of the last step.
+    now: Timestamp,
+    walls_passed: u8,
+    /// Previous position, for the trail.
+    before_m: Option<[f32; 3]>,
+}
+
+impl<'a> Recording<'a> {
+    fn create(path: &Path, settings: &'a SimulatorSettings) -> io::Result<Self> {
+        let options = WriteOptions::new()
+            .library(concat!("skein ", env!("CARGO_PKG_VERSION")))
+            .compression(Some(Compression::Lz4));
+        let file = BufWriter::new(File::create(path)?);
+        let mut writer = options.create(file).map_err(io::Error::other)?;
+        let mut channels = Vec::new();
+        for topic in Topic::ALL {
+            let schema = topic.schema();
+            let schema = writer.add_schema(schema.name, "protobuf", &schema.descriptors);
+            let schema = schema.map_err(io::Error::other)?;
+            let channel = writer.add_channel(schema, topic.name(), "protobuf", &BTreeMap::new());
+            channels.push(channel.map_err(io::Error::other)?);
+        }
+        Ok(Self {
+            settings,
+            writer,
+            channels,
+            sequence: 0,
+            begin_secs: 0.0,
+            now: Timestamp::default(),
+            walls_passed: 0,
+            before_m: None,
+        })
+    }
+
+    /// Writes what the numbers in the steps stand for.
+    fn write_names(&mut self, courses: &Courses) -> io::Result<()> {
+        let of_courses = courses.evaluation().enumerate();
+        let of_courses = of_courses.map(|(number, entry)| (number.to_string(), entry.name.clone()));
+        let of_terms = REWARD_TERM_NAMES.iter().enumerate();
+        let of_terms = of_terms.map(|(number, name)| (number.to_string(), (*name).to_owned()));
+        for (name, metadata) in [
+            ("course_names", of_courses.collect()),
+            ("reward_term_names", of_terms.collect()),
+        ] {
+            let metadata = Metadata {
+                name: name.to_owned(),
+                metadata,
+            };
+            let written = self.writer.write_metadata(&metadata);
+            written.map_err(io::Error::other)?;
+        }
+        Ok(())
+    }
+
+    fn begin_episode(&mut self, title: &str, course: &Course) -> io::Result<()> {
+        self.now = Timestamp::from_secs(self.begin_secs);
+        self.walls_passed = 0;
+        self.before_m = None;
+        self.send(Topic::Scene, &scene::of_course(course, title, self.now))?;
+        self.log(Level::Info, format!("{title} begins"))
+    }
+
+    fn write_step(&mut self, row: &RecordingRow<'_>) -> io::Result<()> {
+        let record = row.record;
+        let secs = f64::from(record.step) * f64::from(self.settings.vehicle.control_period_secs);
+        self.now = Timestamp::from_secs(self.begin_secs + secs);
+        let transforms = FrameTransforms {
+            transforms: scene::frames(record, &self.settings.camera, self.now),
+        };
+        self.send(Topic::Frames, &transforms)?;
+        let calibration = CameraCalibration::of(self.settings.camera.focal_px(), self.now);
+        self.send(Topic::Calibration, &calibration)?;
+        let image = RawImage::of_depth(&record.depth, self.now);
+        self.send(Topic::Image, &image)?;
+        let range_m = self.settings.camera.range_m;
+        let depth = RawImage::in_millimetres(&record.depth, range_m, self.now);
+        self.send(Topic::Depth, &depth)?;
+        self.send_bytes(Topic::Step, &encode_step(row))?;
+        self.send_bytes(Topic::Reward, &encode_reward(record))?;
+        let before_m = self.before_m.replace(record.position_m);
+        if let Some(before_m) = before_m {
+            let trail = scene::trail(record.step, before_m, record.position_m, self.now);
+            self.send(Topic::Scene, &trail)?;
+        }
+        self.log_wall(record)
+    }
+
+    fn log_wall(&mut self, record: &TransitionRecord) -> io::Result<()> {
+        if record.walls_passed <= self.walls_passed {
+            return Ok(());
+        }
+        self.walls_passed = record.walls_passed;
+        self.log(Level::Info, format!("passed wall {}", record.walls_passed))
+    }
+
+    fn end_episode(&mut self, episode: &EvaluatedEpisode) -> io::Result<()> {
+        let (level, event) = match (episode.score.outcome, episode.score.hit_wall) {
+            (Outcome::ReachedEnd, _) => (Level::Info, "reached the end".to_owned()),
+            (Outcome::Collided, Some(wall)) => (Level::Error, format!("hit wall {wall}")),
+            (Outcome::Collided, None) => (Level::Error, "hit the corridor".to_owned()),
+            (Outcome::TimedOut, _) => (Level::Warning, "timed out".to_owned()),
+        };
+        self.log(level, event)?;
+        self.begin_secs = self.now.secs() + PAUSE_SECS;
+        Ok(())
+    }
+
+    fn log(&mut self, level: Level, message: String) -> io::Result<()> {
+        let log = Log::new(level, message, self.now);
+        self.send(Topic::Events, &log)
+    }
+
+    fn send(&mut self, topic: Topic, message: &impl Message) -> io::Result<()> {
+        self.send_bytes(topic, &message.encode_to_vec())
+    }
+
+    fn send_bytes(&mut self, topic: Topic, bytes: &[u8]) -> io::Result<()> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let nanos = self.now.nanos();
+        let header = MessageHeader {
+            channel_id: self.channels[topic as usize],
+            sequence: self.sequence,
+            log_time: nanos,
+            publish_time: nanos,
+        };
+        let written = self.writer.write_to_known_channel(&header, bytes);
+        written.map_err(io::Error::other)
+    }
+
+    fn finish(mut self) -> io::Result<()> {
+        self.writer.finish().map_err(io::Error::other)?;
+        self.writer.into_inner().into_inner()?.sync_all()
+    }
+}

@@ -1,0 +1,253 @@
+//! Curves in a run's TensorBoard files, read as they grow.
+//!
+//! Frame: length (u64), its checksum (u32), message, its checksum (u32). Field numbers are those of
+//! TensorFlow's `event.proto` and `summary.proto`.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::{self, File};
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use prost::Message;
+
+/// Most points kept of a curve; then every second is dropped.
+const MOST_POINTS: usize = 4096;
+/// Longest message with a scalar. Pictures are longer, and skipped.
+const LONGEST_SCALAR: u64 = 4096;
+
+/// A curve's point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Point {
+    /// Training episodes.
+    pub(crate) episode: u64,
+    /// Seconds since 1970.
+    pub(crate) unix_secs: f64,
+    pub(crate) value: f32,
+}
+
+/// The curves read so far, by tag.
+#[derive(Debug, Default)]
+pub(crate) struct Events {
+    curves: BTreeMap<String, Curve>,
+    /// Bytes read of each file.
+    read: HashMap<PathBuf, u64>,
+}
+
+#[derive(Debug)]
+struct Curve {
+    points: Vec<Point>,
+    /// Only every so many points are kept.
+    stride: u64,
+    seen: u64,
+}
+
+impl Events {
+    pub(crate) fn tags(&self) -> impl Iterator<Item = &str> {
+        self.curves.keys().map(String::as_str)
+    }
+
+    pub(crate) fn points(&self, tag: &str) -> &[Point] {
+        self.curves.get(tag).map_or(&[], |curve| &curve.points)
+    }
+
+    /// Reads what was added to the files of `folder`.
+    ///
+    /// # Errors
+    /// If a file cannot be read. A folder that does not exist is empty.
+    pub(crate) fn update(&mut self, folder: &Path) -> io::Result<()> {
+        let mut files: Vec<_> = match fs::read_dir(folder) {
+            Ok(entries) => entries.flatten().map(|entry| entry.path()).collect(),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(error),
+        };
+        files.retain(|path| path.to_string_lossy().contains("tfevents"));
+        files.sort();
+        let lengths: Vec<u64> = files
+            .iter()
+            .map(|path| fs::metadata(path).map_or(0, |file| file.len()))
+            .collect();
+        let cut_back = |(path, &length): (&PathBuf, &u64)| {
+            self.read.get(path).is_some_and(|&read| length < read)
+        };
+        if files.iter().zip(&lengths).any(cut_back) {
+            *self = Self::default();
+        }
+        for path in files {
+            self.read_on(&path)?;
+        }
+        Ok(())
+    }
+
+    fn read_on(&mut self, path: &Path) -> io::Result<()> {
+        let mut at = self.read.get(path).copied().unwrap_or(0);
+        let file = File::open(path)?;
+        let metadata = file.metadata()?;
+        if !metadata.is_file() || metadata.len() == at {
+            return Ok(());
+        }
+        let mut reader = BufReader::new(file);
+        reader.seek(SeekFrom::Start(at))?;
+        let mut message = Vec::new();
+        loop {
+            let mut head = [0; 12];
+            if reader.read_exact(&mut head).is_err() {
+                break;
+            }
+            let length = u64::from_le_bytes(std::array::from_fn(|place| head[place]));
+            let Some(end) = at.checked_add(length).and_then(|end| end.checked_add(16)) else {
+                break;
+            };
+            // The rest is still being written, or damaged.
+            if end > metadata.len() {
+                break;
+            }
+            if length <= LONGEST_SCALAR {
+                message.resize(length as usize + 4, 0);
+                reader.read_exact(&mut message)?;
+                if let Ok(event) = Event::decode(&message[..length as usize]) {
+                    self.take(event);
+                }
+            } else {
+                reader.seek(SeekFrom::Start(end))?;
+            }
+            at = end;
+        }
+        self.read.insert(path.to_owned(), at);
+        Ok(())
+    }
+
+    fn take(&mut self, event: Event) {
+        let (episode, unix_secs) = (event.step.unsigned_abs(), event.wall_time);
+        for Value { tag, simple_value } in event.summary.into_iter().flat_map(|all| all.value) {
+            let Some(value) = simple_value.filter(|value| value.is_finite()) else {
+                continue;
+            };
+            // Each episode's own values stand in episodes.csv.
+            if tag.starts_with("episode/") {
+                continue;
+            }
+            self.curves
+                .entry(tag)
+                .or_insert_with(Curve::new)
+                .push(Point {
+                    episode,
+                    unix_secs,
+                    value,
+                });
+        }
+    }
+}
+
+impl Curve {
+    fn new() -> Self {
+        Self {
+            points: Vec::new(),
+            stride: 1,
+            seen: 0,
+        }
+    }
+
+    fn push(&mut self, point: Point) {
+        // A resumed run repeats episodes after its checkpoint.
+        while self
+            .points
+            .last()
+            .is_some_and(|last| last.episode > point.episode)
+        {
+            self.points.pop();
+        }
+        if self.seen.is_multiple_of(self.stride) {
+            self.points.push(point);
+        }
+        self.seen += 1;
+        if self.points.len() == MOST_POINTS {
+            let mut number = 0;
+            self.points.retain(|_| {
+                number += 1;
+                number % 2 == 1
+            });
+            self.stride *= 2;
+        }
+    }
+}
+
+/// `tensorflow.Event`.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+}
+
+/// `tensorflow.Summary`.
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+/// `tensorflow.Summary.Value`.
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(step: i64, value: f32) -> Vec<u8> {
+        let event = Event {
+            wall_time: step as f64,
+            step,
+            summary: Some(Summary {
+                value: vec![Value {
+                    tag: "policy/temperature".to_owned(),
+                    simple_value: Some(value),
+                }],
+            }),
+        };
+        let message = event.encode_to_vec();
+        let length = (message.len() as u64).to_le_bytes();
+        [&length[..], &[0; 4], &message, &[0; 4]].concat()
+    }
+
+    #[test]
+    fn a_file_is_read_as_it_grows_and_damage_ends_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("events.out.tfevents.1");
+        let mut events = Events::default();
+        let mut values = |bytes: &[u8]| -> Vec<f32> {
+            fs::write(&path, bytes).unwrap();
+            events.update(folder.path()).unwrap();
+            let points = events.points("policy/temperature").iter();
+            points.map(|point| point.value).collect()
+        };
+        let two = [frame(1, 0.5), frame(2, 0.25)].concat();
+        assert_eq!(values(&two[..two.len() - 3]), [0.5]);
+        assert_eq!(values(&two), [0.5, 0.25]);
+        assert_eq!(values(&[&two[..], &[0xff; 40]].concat()), [0.5, 0.25]);
+        assert_eq!(values(&frame(1, 1.5)), [1.5], "cut back");
+    }
+
+    #[test]
+    fn a_long_curve_keeps_its_whole_length_in_bounded_memory() {
+        let mut curve = Curve::new();
+        for episode in 0..1_000_000 {
+            curve.push(Point {
+                episode,
+                unix_secs: 0.0,
+                value: 0.0,
+            });
+        }
+        assert!(curve.points.len() < MOST_POINTS);
+        let last = curve.points.last().map_or(0, |point| point.episode);
+        assert!(curve.points[0].episode == 0 && last > 999_000, "{last}");
+    }
+}
