@@ -200,7 +200,7 @@ mod tests {
             ["2", "0.0 %", "1", "1", "·"]
         );
         assert_eq!(cells("shape: circle")[2..7], ["3", "66.7 %", "1", "·", "·"]);
-        assert_eq!(cells("offset: 1.00 to 1.50 m")[2], "3");
+        assert_eq!(cells("offset: 0.50 to 1.00 m")[2], "3");
         assert_eq!(cells("offset: 1.50 to 2.00 m")[2], "2");
     }
 }
