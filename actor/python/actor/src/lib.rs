@@ -1,8 +1,8 @@
 //! The Python package `skein-rl-actor`: a user's own environment flies tickets of a run.
 //!
-//! `skein_rl.Actor` is its face. It has a wheel of its own because only it needs the transport. What
-//! speaks to the learner is the service of `skein-actor`; [`foreign`] stands in the simulator's
-//! place.
+//! `skein_rl.Actor` is its face. It has a wheel of its own because only it needs the transport.
+//! What speaks to the learner is the service of `skein-actor`; [`foreign`] stands in the
+//! simulator's place.
 
 mod foreign;
 
