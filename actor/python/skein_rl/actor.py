@@ -24,8 +24,8 @@ _REQUIRED: dict[str, tuple[int, ...]] = {"depth": (1, *IMAGE), "velocity": (3,)}
 class Actor:
     """Joins runs as an actor, with an environment in the simulator's place.
 
-    The run's policy flies it, with exploration, for each ticket that the learner issues; the learner
-    takes the episodes like any other actor's. Needs ``pip install skein-rl[actor]``.
+    The run's policy flies it, with exploration, for each ticket that the learner issues; the
+    learner takes the episodes like any other actor's. Needs ``pip install skein-rl[actor]``.
 
     The environment has two actions in [-1, 1] and these parts of a ``Dict`` observation:
 
@@ -142,7 +142,9 @@ class Actor:
 def _check_spaces(env: gymnasium.Env[Any, Any]) -> None:
     spaces = env.observation_space
     if not isinstance(spaces, gymnasium.spaces.Dict):
-        raise ValueError(f"observation_space = {spaces} is no Dict: give \"depth\" and \"velocity\"")
+        raise ValueError(
+            f"observation_space = {spaces} is no Dict: give \"depth\" and \"velocity\""
+        )
     for name, shape in _REQUIRED.items():
         if name not in spaces.spaces:
             raise ValueError(f"observation_space has no {name!r}: the policy needs it, {shape}")

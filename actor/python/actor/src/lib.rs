@@ -1,12 +1,12 @@
 //! The Python package `skein-rl-actor`: a user's own environment flies tickets of a run.
 //!
-//! `skein_rl.Actor` is its face. It has a wheel of its own because only it needs the transport. What
-//! speaks to the learner is the service of `skein-actor`; [`foreign`] stands in the simulator's
-//! place.
+//! `skein_rl.Actor` is its face. It has a wheel of its own because only it needs the transport.
+//! What speaks to the learner is the service of `skein-actor`; [`foreign`] stands in the
+//! simulator's place.
 
 mod foreign;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use pyo3::exceptions::{PyConnectionError, PyValueError};
@@ -34,7 +34,7 @@ fn face(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 /// Flies tickets of the run in `run_dir` in the environment behind `bridge`, until the run is over
-/// or `bridge` asks to stop. Returns `True` if the run is over.
+/// or an exception ends this actor. Returns `True` if the run is over.
 ///
 /// # Errors
 /// What the environment raised; `KeyboardInterrupt`; `ValueError` if the run cannot be joined;
@@ -73,7 +73,7 @@ enum Ending {
     },
 }
 
-fn fly(run_dir: &PathBuf, bridge: Py<PyAny>, failure: &Failure) -> PyResult<Ending> {
+fn fly(run_dir: &Path, bridge: Py<PyAny>, failure: &Failure) -> PyResult<Ending> {
     let directory = RunDirectory::new(run_dir);
     let (identity, config) = directory.open().map_err(refused)?;
     let claim = directory.claim_actor().map_err(refused)?;
