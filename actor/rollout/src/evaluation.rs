@@ -385,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn each_episode_that_was_flown_is_told_once() {
+    fn each_flown_episode_is_reported_once() {
         let told = std::sync::Mutex::new(Vec::new());
         look_at(5, 3, Keep::Scores, |evaluation| {
             let tell = |flown| told.lock().unwrap().push(flown);

@@ -15,8 +15,10 @@ use crate::events::{Events, Point};
 const MOST_POINTS: usize = 600;
 /// Episodes that a point of a training curve is the mean of, as in the terminal.
 const WINDOW: usize = 50;
+/// Value of a curve in one episode.
+type OfEpisode = fn(&Episode) -> f64;
 /// Curves from `episodes.csv`.
-const OF_EPISODES: [(&str, fn(&Episode) -> f64); 3] = [
+const OF_EPISODES: [(&str, OfEpisode); 3] = [
     ("walls passed", |row| f64::from(row.walls_passed)),
     ("return", |row| f64::from(row.episode_return)),
     ("steps per episode", |row| f64::from(row.steps)),
