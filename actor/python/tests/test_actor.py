@@ -173,7 +173,13 @@ def test_ctrl_c_ends_an_actor_that_waits_and_one_that_flies(broken):
     command = [sys.executable, "-c", program, broken.directory]
     folder = pathlib.Path(__file__).parent
     process = subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where these tests run in the background, a shell has them ignore the signal.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert process.stdout.readline() == "flying\n"
     process.send_signal(signal.SIGINT)
