@@ -1,6 +1,8 @@
 //! A SAC update beside the same update in JAX (`sac_peer.py`), on one thread and on two, in turns.
 //!
-//! `tests/bench.sh --peer` sets JAX up and names its Python in `SKEIN_PEER_PYTHON`.
+//! `tests/bench.sh --only sac_peer` sets JAX up and names its Python in `SKEIN_PEER_PYTHON`.
+
+mod common;
 
 use std::env;
 use std::path::Path;
@@ -8,14 +10,13 @@ use std::process::Command;
 use std::time::Instant;
 
 use skein_kernels::{Isa, Team};
-use skein_learner::algorithm::{Algorithm, Columns, Inputs};
+use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::noise::Noise;
 use skein_learner::sac::NativeSac;
-use skein_protocol::ACTION;
 use skein_protocol::config::SacSection;
 
-/// Width of an observation, as in `sac_peer.py`.
-const OBSERVATION: usize = 34;
+use common::{OBSERVATION, Transitions};
+
 /// Updates of a sample, so that a clock's tick and JAX's call do not count.
 const UPDATES: usize = 20;
 
@@ -30,7 +31,7 @@ fn main() {
     let quick = env::args().any(|argument| argument == "--quick");
     let (rounds, samples) = if quick { (1, 2) } else { (4, 30) };
     let python = env::var("SKEIN_PEER_PYTHON")
-        .expect("SKEIN_PEER_PYTHON names a Python with JAX: run tests/bench.sh --peer");
+        .expect("SKEIN_PEER_PYTHON names a Python with JAX: run tests/bench.sh --only sac_peer");
     let mut fastest = [Fastest {
         ours: f64::INFINITY,
         jax: f64::INFINITY,
@@ -62,23 +63,8 @@ fn print(name: &str, secs: f64) {
 /// Returns the seconds of one of our updates in the fastest of `samples`.
 fn ours(threads: usize, samples: usize) -> f64 {
     let section = SacSection::default();
-    let rows = section.batch_size;
-    let mut noise = Noise::new(1);
-    let mut draw =
-        |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
-    let [observations, actions, rewards, next_observations] =
-        [OBSERVATION, ACTION, 1, OBSERVATION].map(&mut draw);
-    let columns = Columns {
-        observations: &observations,
-        actions: &actions,
-        rewards: &rewards,
-        next_observations: &next_observations,
-        states: &observations,
-        next_states: &next_observations,
-        terminated: &vec![0.0; rows],
-        images: None,
-        teacher_actions: None,
-    };
+    let transitions = Transitions::random(section.batch_size);
+    let columns = transitions.columns();
     let mut sac = NativeSac::new(&section, Inputs::same(OBSERVATION), 1, Isa::best());
     let (mut team, mut noise) = (Team::new(threads), Noise::new(2));
     let mut sample = || {

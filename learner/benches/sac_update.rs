@@ -1,6 +1,8 @@
 //! A SAC update, batch 256, on one thread: native with networks of growing width, and on libtorch
 //! with automatic gradients.
 
+mod common;
+
 use criterion::{BenchmarkId, Criterion, Throughput};
 use skein_kernels::{Isa, Team};
 use skein_learner::algorithm::{Algorithm, Columns, Inputs};
@@ -11,31 +13,16 @@ use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-/// Width of an observation, as in `one-course.toml`.
-const OBSERVATION: usize = 34;
+use common::{OBSERVATION, Transitions};
+
 /// Default width of hidden layers.
 const WIDTH: usize = 256;
 
 fn main() {
     let mut criterion = Criterion::default().configure_from_args();
     use_threads(1);
-    let rows = SacSection::default().batch_size;
-    let mut noise = Noise::new(1);
-    let mut draw =
-        |width: usize| -> Vec<f32> { (0..rows * width).map(|_| noise.uniform(1.0)).collect() };
-    let [observations, actions, rewards, next_observations] =
-        [OBSERVATION, ACTION, 1, OBSERVATION].map(&mut draw);
-    let columns = Columns {
-        observations: &observations,
-        actions: &actions,
-        rewards: &rewards,
-        next_observations: &next_observations,
-        states: &observations,
-        next_states: &next_observations,
-        terminated: &vec![0.0; rows],
-        images: None,
-        teacher_actions: None,
-    };
+    let transitions = Transitions::random(SacSection::default().batch_size);
+    let columns = transitions.columns();
     for width in [64, 128, WIDTH, 512, 1024] {
         update(&mut criterion, Engine::Native, width, columns);
     }

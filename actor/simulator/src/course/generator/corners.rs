@@ -3,6 +3,7 @@
 //! Each function draws corners `[y, z]`, counter-clockwise and of arbitrary scale.
 
 use std::f32::consts::TAU;
+use std::ops::RangeInclusive;
 
 use rand::{Rng, RngExt};
 
@@ -62,23 +63,10 @@ pub(super) fn blob(rng: &mut impl Rng) -> Shape {
 }
 
 pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
-    // The slot starts between the head's last corner and its first, both on the unit circle.
     let (sides, half_slot) = (rng.random_range(5..=8), rng.random_range(0.065..=0.11));
     let (length, taper) = (rng.random_range(0.8..=1.8), rng.random_range(0.7..=1.1));
     let [neck, edge] = polar(half_slot, 1.0);
-    let head = (0..=sides).map(|corner| {
-        let share = half_slot + (1.0 - 2.0 * half_slot) * corner as f32 / sides as f32;
-        let is_neck = corner == 0 || corner == sides;
-        polar(
-            share,
-            if is_neck {
-                1.0
-            } else {
-                rng.random_range(0.85..=1.15)
-            },
-        )
-    });
-    let mut points_m: Vec<_> = head.collect();
+    let mut points_m = open_head(sides, half_slot, 0.85..=1.15, rng);
     points_m.extend([-1.0, 1.0].map(|side| [neck + length, side * taper * edge]));
     Shape::Polygon { points_m }
 }
@@ -87,22 +75,28 @@ pub(super) fn keyhole(rng: &mut impl Rng) -> Shape {
 pub(super) fn notch(rng: &mut impl Rng) -> Shape {
     let (sides, half_width) = (rng.random_range(7..=10), rng.random_range(0.15..=0.3_f32));
     let (end, taper) = (rng.random_range(-0.25..=0.1), rng.random_range(0.7..=1.1));
-    let beside = half_width.asin() / TAU;
-    let head = (0..=sides).map(|corner| {
-        let share = beside + (1.0 - 2.0 * beside) * corner as f32 / sides as f32;
-        let is_edge = corner == 0 || corner == sides;
-        polar(
-            share,
-            if is_edge {
-                1.0
-            } else {
-                rng.random_range(0.9..=1.1)
-            },
-        )
-    });
-    let mut points_m: Vec<_> = head.collect();
+    let mut points_m = open_head(sides, half_width.asin() / TAU, 0.9..=1.1, rng);
     points_m.extend([-1.0, 1.0].map(|side| [end, side * taper * half_width]));
     Shape::Polygon { points_m }
+}
+
+/// Corners around a centre, at random `radii`, that leave a gap of `half_gap` turns on either side
+/// of the axis y. The first and the last, at the gap, are on the unit circle.
+fn open_head(
+    sides: i32,
+    half_gap: f32,
+    radii: RangeInclusive<f32>,
+    rng: &mut impl Rng,
+) -> Vec<[f32; 2]> {
+    let corner = |corner| {
+        let share = half_gap + (1.0 - 2.0 * half_gap) * corner as f32 / sides as f32;
+        let radius = match corner {
+            _ if corner == 0 || corner == sides => 1.0,
+            _ => rng.random_range(radii.clone()),
+        };
+        polar(share, radius)
+    };
+    (0..=sides).map(corner).collect()
 }
 
 /// The unit disc without a second one: around on its own edge, back on the edge of the second.
