@@ -54,7 +54,7 @@ pub fn bar_on_terminal() -> Option<ProgressBar> {
 /// Standard error as a terminal that no redraw waits for.
 #[derive(Debug, Default)]
 struct Terminal {
-    /// What the present redraw has written.
+    /// Text of the present redraw.
     drawn: Mutex<String>,
 }
 

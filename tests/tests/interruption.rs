@@ -6,10 +6,12 @@
 )]
 
 use std::fs::OpenOptions;
-use std::process::Command;
+use std::io::Write;
+use std::process::{Command, Stdio};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::summary::RunEnding;
@@ -189,6 +191,40 @@ fn a_run_whose_terminal_is_lost_completes_and_ignored_signals_stay_ignored() {
     let summary = directory.summary().unwrap();
     assert_eq!(summary.ending, RunEnding::Completed);
     assert!(directory.evaluation_json().is_file());
+}
+
+/// As behind Ctrl-S, or a connection that hangs: a write to such a terminal waits for ever.
+#[test]
+fn a_run_whose_terminal_takes_no_more_completes() {
+    let folder = tempfile::tempdir().unwrap();
+    let directory = RunDirectory::new(folder.path().canonicalize().unwrap().join("run"));
+    let (_reader, mut pipe) = std::io::pipe().unwrap();
+    let flags = fcntl_getfl(&pipe).unwrap();
+    fcntl_setfl(&pipe, flags | OFlags::NONBLOCK).unwrap();
+    while pipe.write(&[b'x'; 4096]).is_ok() {}
+    fcntl_setfl(&pipe, flags).unwrap();
+    let mut supervisor = Command::new(program("skein"))
+        .args(["run", "--actors", "1", "--config"])
+        .arg(repository().join("tests/small.toml"))
+        .arg("--run-dir")
+        .arg(directory.root())
+        .stdout(Stdio::null())
+        .stderr(pipe)
+        .spawn()
+        .unwrap();
+    let deadline = Instant::now() + Duration::from_secs(120);
+    let status = loop {
+        if let Some(status) = supervisor.try_wait().unwrap() {
+            break status;
+        }
+        if Instant::now() >= deadline {
+            supervisor.kill().unwrap();
+            panic!("it waits for its terminal");
+        }
+        sleep(Duration::from_millis(20));
+    };
+    assert!(status.success());
+    assert_eq!(directory.summary().unwrap().ending, RunEnding::Completed);
 }
 
 /// As Ctrl-Z, and later fg. The processes of the run are not stopped: each leads its own group.

@@ -1,4 +1,4 @@
-//! What a ticket is flown in: the simulator, or an environment from elsewhere.
+//! Worlds that tickets are flown in: the simulator, or an environment from elsewhere.
 //!
 //! [`EnvironmentLoop`](crate::environment_loop::EnvironmentLoop) knows no more of it than this. A
 //! [`Worlds`] has the [`World`] of each ticket: a simulator belongs to one course.
@@ -14,7 +14,7 @@ use crate::environment_loop::{self, EpisodeFault};
 
 /// Worlds of one actor, selected by tickets.
 pub trait Worlds {
-    /// What an episode takes place in.
+    /// World of one episode.
     type World: World;
 
     /// Starts the episode of `ticket` in its world.

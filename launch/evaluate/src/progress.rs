@@ -1,12 +1,11 @@
 //! How far an evaluation is, in one line of the terminal.
 
-use std::io::Write;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use skein_reports::Clock;
-use skein_run::note;
 use skein_run::terminal::{can_redraw, cut, stderr_columns};
+use skein_run::{note, notes};
 
 /// Least time between two lines on a terminal, where a line replaces the one before.
 const REDRAW: Duration = Duration::from_millis(200);
@@ -46,7 +45,7 @@ impl Progress {
         let line = line(flown, self.episodes, self.begun.elapsed());
         *last = (Instant::now(), self.redraws);
         match self.redraws {
-            true => write(&format!("\r\x1b[2K{}", cut(&line, stderr_columns()))),
+            true => notes::write(format!("\r\x1b[2K{}", cut(&line, stderr_columns()))),
             false => note!("{line}"),
         }
     }
@@ -55,16 +54,9 @@ impl Progress {
     pub(crate) fn finish(&self) {
         let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
         if last.1 {
-            write("\r\x1b[2K");
+            notes::write("\r\x1b[2K".to_owned());
         }
     }
-}
-
-/// Writes to the terminal at once. A failure loses the text and changes nothing else.
-fn write(text: &str) {
-    let mut stderr = std::io::stderr().lock();
-    let _ = stderr.write_all(text.as_bytes());
-    let _ = stderr.flush();
 }
 
 fn line(flown: u64, episodes: u64, passed: Duration) -> String {

@@ -5,8 +5,8 @@
 //! supervisor, and leftovers of dead processes are swept. Other modules hold what all of Skein's
 //! programs share: atomically written files ([`durable`]), logs ([`logging`]), allocator settings
 //! ([`allocation`]), errors on one line ([`failure`]), points at which tests kill a process
-//! ([`fault`]), output for the terminal ([`terminal`], [`notes`], [`tables`]), ignored signals ([`signals`]),
-//! limits of memory ([`control_groups`]).
+//! ([`fault`]), output for the terminal ([`terminal`], [`notes`], [`tables`]), ignored signals
+//! ([`signals`]), limits of memory ([`control_groups`]).
 //!
 //! Identity and announcement are here and not in the protocol, because they name this machine's
 //! folders and locks, and only processes of this machine read them.

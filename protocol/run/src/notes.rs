@@ -1,10 +1,11 @@
 //! Standard error that holds nothing up.
 //!
-//! A terminal stopped by Ctrl-S, or a reader that reads no more, lets a write wait for ever. Where a
-//! program must not wait, a thread of its own writes, and text that finds it busy is lost.
+//! A terminal stopped by Ctrl-S, or a reader that reads no more, lets a write wait for ever. Where
+//! a program must not wait, a thread of its own writes, and text that finds it busy is lost.
 
 use std::io::{self, Write};
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -38,7 +39,7 @@ pub fn never_wait() {
 /// Writes `text` to standard error, or loses it.
 pub fn write(text: String) {
     match QUEUE.get() {
-        Some(queue) => drop(queue.try_send(Message::Text(text))),
+        Some(queue) => offer(queue, text),
         None => {
             let mut stream = io::stderr().lock();
             let _ = stream.write_all(text.as_bytes());
@@ -47,24 +48,35 @@ pub fn write(text: String) {
     }
 }
 
-/// Waits until what was written before is on standard error, for a second at most.
+/// Waits until what was written before is on standard error, for a second at most. Once that was
+/// in vain, no later call waits.
 pub fn settle() {
-    if let Some(queue) = QUEUE.get() {
-        settle_within(queue, SETTLED_WITHIN);
+    static IN_VAIN: AtomicBool = AtomicBool::new(false);
+    if let Some(queue) = QUEUE.get()
+        && !IN_VAIN.load(Ordering::Relaxed)
+    {
+        let settled = settle_within(queue, SETTLED_WITHIN);
+        IN_VAIN.store(!settled, Ordering::Relaxed);
     }
 }
 
-fn settle_within(queue: &SyncSender<Message>, limit: Duration) {
+/// Loses `text` if the queue is full.
+fn offer(queue: &SyncSender<Message>, text: String) {
+    drop(queue.try_send(Message::Text(text)));
+}
+
+/// Returns `true` if all that was written before is written.
+fn settle_within(queue: &SyncSender<Message>, limit: Duration) -> bool {
     let deadline = Instant::now() + limit;
     let (answer, answered) = sync_channel(1);
     while let Err(TrySendError::Full(_)) = queue.try_send(Message::Settle(answer.clone())) {
         if Instant::now() >= deadline {
-            return;
+            return false;
         }
         thread::sleep(PAUSE);
     }
     let left = deadline.saturating_duration_since(Instant::now());
-    let _ = answered.recv_timeout(left);
+    answered.recv_timeout(left).is_ok()
 }
 
 fn write_all(messages: Receiver<Message>, mut output: impl Write) {
@@ -94,9 +106,9 @@ mod tests {
         let begun = Instant::now();
         // Far more than a pipe and the queue hold.
         for number in 0..2000 {
-            drop(queue.try_send(Message::Text(line(number))));
+            offer(&queue, line(number));
         }
-        settle_within(&queue, Duration::from_millis(50));
+        assert!(!settle_within(&queue, Duration::from_millis(50)));
         assert!(begun.elapsed() < Duration::from_secs(5));
         drop(queue);
         let mut read = String::new();
@@ -116,7 +128,7 @@ mod tests {
         let (queue, receiver) = sync_channel(MOST_WAITING);
         thread::spawn(|| write_all(receiver, writer));
         queue.send(Message::Text("text".to_owned())).unwrap();
-        settle_within(&queue, Duration::from_secs(20));
+        assert!(settle_within(&queue, Duration::from_secs(20)));
         let mut text = [0; 4];
         reader.read_exact(&mut text).unwrap();
         assert_eq!(&text, b"text");

@@ -19,8 +19,8 @@ pub fn is_ignored(number: i32) -> bool {
     is_in_mask(&status, number)
 }
 
-/// Returns a flag that SIGTERM, SIGINT and SIGHUP set. One that comes while the flag is set ends the
-/// process at once. One that was ignored when this process started stays ignored.
+/// Returns a flag that SIGTERM, SIGINT and SIGHUP set. One that comes while the flag is set ends
+/// the process at once. One that was ignored when this process started stays ignored.
 ///
 /// # Errors
 /// If the system installs no handler.

@@ -71,7 +71,7 @@ pub(crate) struct ForeignWorlds<'a> {
     image: Box<[u8; IMAGE_PIXELS]>,
 }
 
-/// What the run asks of an environment.
+/// Limits that the run sets an environment.
 struct Limits {
     /// Longest time for a reset or a step: then the learner takes the actor for dead.
     silence: Duration,

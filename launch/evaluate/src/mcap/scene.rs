@@ -1,4 +1,4 @@
-//! The scene that a viewer draws in 3-D: the corridor, its walls, the drone and its trail, and the frames.
+//! Scene that a viewer draws in 3-D: the corridor, its walls, the drone and its trail, the frames.
 
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
