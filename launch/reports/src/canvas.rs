@@ -111,18 +111,7 @@ impl Canvas {
     /// # Errors
     /// [`ReportError::Write`] names the file.
     pub(super) fn save(&self, path: &Path) -> Result<(), ReportError> {
-        let target = target(path);
-        let aside = unfinished_picture(path);
-        self.write(&aside)
-            .and_then(|()| fs::rename(&aside, &target))
-            .map_err(|source| {
-                // A partial picture is useless. If there is none, removing it does nothing.
-                let _ = fs::remove_file(&aside);
-                ReportError::Write {
-                    path: path.to_owned(),
-                    source,
-                }
-            })
+        replace_picture(path, |aside| self.write(aside))
     }
 
     fn write(&self, path: &Path) -> io::Result<()> {
@@ -170,6 +159,28 @@ impl Canvas {
     }
 }
 
+/// Writes the picture `path` with `write`, under another name until it is complete. An existing
+/// picture is replaced atomically; if a link names it, the link stays.
+///
+/// # Errors
+/// [`ReportError::Write`] names the file.
+pub(super) fn replace_picture(
+    path: &Path,
+    write: impl FnOnce(&Path) -> io::Result<()>,
+) -> Result<(), ReportError> {
+    let aside = unfinished_picture(path);
+    write(&aside)
+        .and_then(|()| fs::rename(&aside, target(path)))
+        .map_err(|source| {
+            // A partial picture is useless. If there is none, removing it does nothing.
+            let _ = fs::remove_file(&aside);
+            ReportError::Write {
+                path: path.to_owned(),
+                source,
+            }
+        })
+}
+
 /// Returns the name under which the picture at `path` is written; links are followed.
 pub fn unfinished_picture(path: &Path) -> PathBuf {
     target(path).with_extension(match path.extension() {
@@ -179,7 +190,7 @@ pub fn unfinished_picture(path: &Path) -> PathBuf {
 }
 
 /// Returns where a picture goes: links are followed.
-pub(super) fn target(path: &Path) -> PathBuf {
+fn target(path: &Path) -> PathBuf {
     destination(path).unwrap_or_else(|| path.to_owned())
 }
 

@@ -1,7 +1,7 @@
 //! Moving picture of an episode: the drone in its corridor from above and from the side, what its
 //! camera sees, and the latent code that the policy sees instead.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH};
 use skein_simulator::course::{Course, DRONE_WIDTH_M, Wall};
 
 use super::ReportError;
-use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px, target, unfinished_picture};
+use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px, replace_picture};
 use super::trajectories::{CORRIDOR, WALL, open_in_cut_m};
 
 const WIDTH: u32 = 640;
@@ -331,17 +331,7 @@ impl Film {
         if let Some(last) = self.frames.last_mut() {
             last.delay = LAST_DELAY;
         }
-        let aside = unfinished_picture(path);
-        self.write(&aside)
-            .and_then(|()| fs::rename(&aside, target(path)))
-            .map_err(|source| {
-                // A partial film is useless. If there is none, removing it does nothing.
-                let _ = fs::remove_file(&aside);
-                ReportError::Write {
-                    path: path.to_owned(),
-                    source,
-                }
-            })
+        replace_picture(path, |aside| self.write(aside))
     }
 
     fn write(&self, path: &Path) -> io::Result<()> {
