@@ -7,6 +7,7 @@ use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 use clap::Parser;
+use skein_actor::recorder::Recorder;
 use skein_actor::service::{ExitReason, Service};
 use skein_inference::Network;
 use skein_kernels::Isa;
@@ -89,7 +90,10 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
     let (isa, camera) = (Isa::best(), InstructionSet::best());
     info!(%actor, pid = std::process::id(), run = %identity.run, %isa, %camera, "actor started");
     let _presence = Presence::enter(&identity)?;
-    let simulators = Simulators::new(Arc::new(Courses::of_run(&config)?));
+    let courses = Arc::new(Courses::of_run(&config)?);
+    let recorder = Recorder::start(&config, directory.recordings(), Arc::clone(&courses))
+        .context("cannot start the thread that records")?;
+    let simulators = Simulators::new(courses);
     // Each join assigns a new incarnation.
     let mut environment_loop = EnvironmentLoop::new(
         actor,
@@ -104,5 +108,6 @@ fn run(arguments: &Arguments) -> anyhow::Result<ExitReason> {
         );
     }
     let exit_requested = || exit_requested.load(Ordering::Relaxed);
-    Ok(Service::new(&identity, &config, actor, &exit_requested).serve(&mut environment_loop)?)
+    let service = Service::new(&identity, &config, actor, &exit_requested).with_recorder(recorder);
+    Ok(service.serve(&mut environment_loop)?)
 }

@@ -21,6 +21,7 @@ use skein_transport::{ActorPorts, JoinError, ServiceError};
 use tracing::{debug, info, info_span, warn};
 
 use self::connection::LearnerConnection;
+use crate::recorder::Recorder;
 use skein_inference::Network;
 use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
 use skein_rollout::world::Worlds;
@@ -40,6 +41,7 @@ pub struct Service<'a> {
     /// Time of the last heartbeat from a learner; at first, the start of this service.
     last_heard: Instant,
     newest_learner: Option<LearnerIncarnation>,
+    recorder: Option<Recorder>,
 }
 
 /// Reason why an actor exits.
@@ -82,7 +84,15 @@ impl<'a> Service<'a> {
             incarnation: ActorIncarnation(0),
             last_heard: Instant::now(),
             newest_learner: None,
+            recorder: None,
         }
+    }
+
+    /// Also records episodes, if there is a `recorder`.
+    #[must_use]
+    pub fn with_recorder(mut self, recorder: Option<Recorder>) -> Self {
+        self.recorder = recorder;
+        self
     }
 
     /// Flies tickets as they arrive, until there is a reason to exit.
@@ -110,7 +120,8 @@ impl<'a> Service<'a> {
             die_if_armed(FaultPoint::ActorJoined);
             environment_loop.begin_incarnation(self.incarnation);
             let mut connection = LearnerConnection::new(&self, ports);
-            let disconnect_reason = serve_learner(environment_loop, &mut connection);
+            let recorder = self.recorder.as_mut();
+            let disconnect_reason = serve_learner(environment_loop, &mut connection, recorder);
             self.last_heard = connection.last_heard();
             match disconnect_reason {
                 Ok(DisconnectReason::Exit(ending)) => return Ok(ending),
@@ -186,6 +197,7 @@ fn next_incarnation(last: ActorIncarnation) -> ActorIncarnation {
 fn serve_learner<W: Worlds>(
     environment_loop: &mut EnvironmentLoop<W>,
     connection: &mut LearnerConnection<'_>,
+    mut recorder: Option<&mut Recorder>,
 ) -> Result<DisconnectReason, ServiceError> {
     connection.report(ActorState::Serving)?;
     let disconnect_reason = loop {
@@ -194,7 +206,10 @@ fn serve_learner<W: Worlds>(
             break disconnect_reason;
         }
         match connection.take_ticket() {
-            Some((ticket, network)) => fly(environment_loop, &ticket, &network, connection)?,
+            Some((ticket, network)) => {
+                let recorder = recorder.as_deref_mut();
+                fly(environment_loop, &ticket, &network, connection, recorder)?;
+            }
             None => connection.wait()?,
         }
     };
@@ -214,6 +229,7 @@ fn fly<W: Worlds>(
     ticket: &Ticket,
     network: &Network,
     connection: &mut LearnerConnection<'_>,
+    mut recorder: Option<&mut Recorder>,
 ) -> Result<(), ServiceError> {
     let span = info_span!(
         "episode",
@@ -222,10 +238,19 @@ fn fly<W: Worlds>(
         policy = %ticket.policy_version
     );
     let _entered = span.enter();
-    match environment_loop.fly(ticket, network, connection) {
+    let flown = match &mut recorder {
+        Some(recorder) => {
+            environment_loop.fly(ticket, network, &mut recorder.tap(ticket, connection))
+        }
+        None => environment_loop.fly(ticket, network, connection),
+    };
+    match flown {
         Ok(None) => debug!(steps = ticket.first_step(), "segment flown"),
         Ok(Some(score)) => {
             connection.episodes_flown += 1;
+            if let Some(recorder) = recorder {
+                recorder.keep(ticket, score);
+            }
             debug!(
                 walls = score.walls_passed,
                 outcome = score.outcome.name(),

@@ -12,9 +12,6 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 
 use crate::checkpoint::EpochOrder;
 
-/// Distance between the first episode numbers of two evaluations, so that no number occurs twice.
-const EVALUATION_STRIDE: u64 = 1 << 24;
-
 /// Number of epochs of the whole run; the last one may be shorter.
 pub(crate) fn epochs(config: &Config) -> u64 {
     config
@@ -64,7 +61,7 @@ pub(crate) fn evaluation(
     courses: std::ops::Range<u32>,
     episodes: u64,
 ) -> Vec<Ticket> {
-    let first = EpisodeId::FIRST_EVALUATION.0 + evaluation * EVALUATION_STRIDE;
+    let first = EpisodeId::FIRST_EVALUATION.0 + evaluation * EpisodeId::EVALUATION_STRIDE;
     let ticket = |(number, (course, episode))| Ticket {
         run,
         episode: EpisodeId(first + number),

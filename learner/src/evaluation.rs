@@ -133,8 +133,14 @@ fn write_trajectory(
     Ok(())
 }
 
-/// Writes some depth images beside their reconstructions, `reconstructions.safetensors`. Writes
-/// nothing where there is no VAE.
+/// Depth images and their reconstructions, `[n, 72, 128]` each.
+pub(crate) struct Reconstructions {
+    pub(crate) depth: Vec<u8>,
+    pub(crate) reconstruction: Vec<u8>,
+}
+
+/// Writes some depth images beside their reconstructions, `reconstructions.safetensors`, and
+/// returns them. Writes nothing where there is no VAE.
 ///
 /// # Errors
 /// [`EvaluationWriteError`] names the file.
@@ -142,7 +148,7 @@ pub(crate) fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
     episodes: &[CommittedEpisode],
-) -> Result<(), EvaluationWriteError> {
+) -> Result<Option<Reconstructions>, EvaluationWriteError> {
     let depth = episodes
         .iter()
         .filter_map(|episode| episode.depth.as_deref())
@@ -158,12 +164,16 @@ pub(crate) fn write_reconstructions(
         .copied()
         .collect();
     let Some(reconstruction) = trainer.reconstruct(&chosen) else {
-        return Ok(());
+        return Ok(None);
     };
     let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
     let view = |bytes| TensorView::new(Dtype::U8, shape.clone(), bytes);
     let file = view(&chosen)
         .and_then(|depth| Ok([("depth", depth), ("reconstruction", view(&reconstruction)?)]))
         .and_then(|tensors| safetensors::serialize(tensors, None));
-    replace(&directory.reconstructions(), file)
+    replace(&directory.reconstructions(), file)?;
+    Ok(Some(Reconstructions {
+        depth: chosen,
+        reconstruction,
+    }))
 }

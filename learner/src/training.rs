@@ -315,7 +315,12 @@ impl Training<'_> {
     fn write_curves(&mut self) -> Result<(), TrainingError> {
         let curves = std::mem::take(&mut self.curves);
         let faults = self.receiver.state().faults();
-        let points = curves.points(self.epoch_started.elapsed(), self.trainer.replay(), &faults);
+        let points = curves.points(
+            self.config,
+            self.epoch_started.elapsed(),
+            self.trainer.replay(),
+            &faults,
+        );
         self.epoch_started = Instant::now();
         self.metrics.scalars(self.last_episode(), &points)?;
         Ok(self.metrics.flush()?)

@@ -54,4 +54,16 @@ id! {
 impl EpisodeId {
     /// First evaluation episode; far above all training episodes.
     pub const FIRST_EVALUATION: Self = Self(1 << 63);
+    /// Distance between the first episodes of two evaluations, so that no number occurs twice.
+    pub const EVALUATION_STRIDE: u64 = 1 << 24;
+
+    /// Returns the number of the evaluation, and the episode's number within it, each from 0;
+    /// `None` for a training episode.
+    pub fn in_evaluation(self) -> Option<(u64, u64)> {
+        let number = self.0.checked_sub(Self::FIRST_EVALUATION.0)?;
+        Some((
+            number / Self::EVALUATION_STRIDE,
+            number % Self::EVALUATION_STRIDE,
+        ))
+    }
 }

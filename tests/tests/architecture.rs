@@ -113,11 +113,23 @@ fn every_package_has_only_its_allowed_dependencies() {
             &[torch, transport, tokio],
         ),
         (
+            "skein-recordings",
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-rollout",
+                "skein-simulator",
+            ],
+            &[torch, transport, tokio],
+        ),
+        (
             "skein-evaluate",
             &[
                 "skein-inference",
                 "skein-kernels",
                 "skein-protocol",
+                "skein-recordings",
                 "skein-reports",
                 "skein-rollout",
                 "skein-run",
@@ -131,6 +143,7 @@ fn every_package_has_only_its_allowed_dependencies() {
                 "skein-inference",
                 "skein-kernels",
                 "skein-protocol",
+                "skein-recordings",
                 "skein-rollout",
                 "skein-run",
                 "skein-simulator",
@@ -203,6 +216,7 @@ fn every_package_has_only_its_allowed_dependencies() {
                 "skein-inference",
                 "skein-kernels",
                 "skein-protocol",
+                "skein-recordings",
                 "skein-rollout",
                 "skein-run",
                 "skein-simulator",
@@ -213,7 +227,15 @@ fn every_package_has_only_its_allowed_dependencies() {
         // The page reads files: it can start, change and join nothing.
         (
             "skein-watch",
-            &["skein-protocol", "skein-run", "skein-simulator"],
+            &[
+                "skein-inference",
+                "skein-kernels",
+                "skein-protocol",
+                "skein-recordings",
+                "skein-rollout",
+                "skein-run",
+                "skein-simulator",
+            ],
             &[torch, transport],
         ),
         // An experiment starts `skein run`: it knows no supervisor.
@@ -239,6 +261,7 @@ fn every_package_has_only_its_allowed_dependencies() {
                 "skein-kernels",
                 "skein-prepare",
                 "skein-protocol",
+                "skein-recordings",
                 "skein-reports",
                 "skein-rollout",
                 "skein-run",

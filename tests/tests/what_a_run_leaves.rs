@@ -292,7 +292,8 @@ fn the_newest_checkpoint_is_of_the_end(run: &EndedRun) {
 /// the format; the others hold named curves.
 fn the_curves_are_in_an_event_file(run: &EndedRun) {
     let folder = run.directory.tensorboard();
-    let names = names_in(&folder);
+    let mut names = names_in(&folder);
+    assert!(names.remove("over_steps"), "{names:?}");
     assert!(
         names.len() == 1 && names.iter().all(|name| name.contains("tfevents")),
         "{names:?}"

@@ -13,7 +13,7 @@ actor flies for a ticket of seed ``s``.
 
 from gymnasium.envs.registration import register, registry
 
-from . import export, sb3
+from . import export, rerun, sb3
 from ._core import REWARD_TERMS, SHIPPED_COURSES, __version__
 from .actor import Actor
 from .data import Recording, Run, read_recording, read_run, to_minari
@@ -39,6 +39,7 @@ __all__ = [
     "make_vec",
     "read_recording",
     "read_run",
+    "rerun",
     "sb3",
     "to_minari",
 ]

@@ -10,7 +10,13 @@ const OUTCOMES = { collided: "#d55e00", timed_out: "#cc79a7", reached_end: "#007
 const OUTCOME_NAMES = { collided: "collided", timed_out: "timed out", reached_end: "reached the end" };
 const MOST_COMPARED = COLOURS.length * DASHES.length;
 
-const state = { runs: [], chosen: [], view: "curves", curve: "walls passed", over: "episodes", course: 0, flight: 0 };
+const IMAGE = { width: 128, height: 72 };
+const PLAY_PERIOD_MS = 100;
+
+const state = {
+  runs: [], chosen: [], view: "curves", curve: "walls passed", over: "episodes", course: 0, flight: 0,
+  source: "recordings", follow: true, recording: null, episode: 0,
+};
 const view = document.getElementById("view");
 let drawing = 0;
 
@@ -25,12 +31,20 @@ function element(name, attributes = {}, ...children) {
   return made;
 }
 
-async function ask(path, parameters = []) {
+async function request(path, parameters = []) {
   const query = new URLSearchParams(parameters);
   const answer = await fetch(`api/${path}?${query}`);
+  if (answer.ok) return answer;
   const json = await answer.json();
-  if (!answer.ok) throw new Error(json.error || `the server answered ${answer.status}`);
-  return json;
+  throw new Error(json.error || `the server answered ${answer.status}`);
+}
+
+async function ask(path, parameters) {
+  return (await request(path, parameters)).json();
+}
+
+async function askBytes(path, parameters) {
+  return new Uint8Array(await (await request(path, parameters)).arrayBuffer());
 }
 
 function colour(name) {
@@ -101,7 +115,7 @@ function showList() {
   const running = state.runs.filter((run) => run.state === "running").length;
   document.getElementById("status").textContent = state.runs.length === 0
     ? "no runs in this folder yet: they appear here by themselves"
-    : `${state.runs.length} runs, ${running} running`;
+    : `${state.runs.length} ${state.runs.length === 1 ? "run" : "runs"}, ${running} running`;
 }
 
 function choose(id, wanted) {
@@ -120,8 +134,9 @@ function take(runs) {
   if (state.chosen.length === 0 && runs.length > 0) state.chosen = [runs[0].id];
   showList();
   const now = JSON.stringify(runs.filter((run) => state.chosen.includes(run.id)));
-  // Flights do not change while one looks at them from a chosen side.
-  if (before !== now && (state.view !== "flights" || before === "[]")) show();
+  // A flight does not change while one looks at it from a chosen side.
+  const looks = state.view === "flights" && before !== "[]" && (!state.follow || playing !== null);
+  if (before !== now && !looks) show();
 }
 
 // Views
@@ -129,22 +144,28 @@ function take(runs) {
 async function show() {
   const mine = ++drawing;
   const kept = view.dataset.view === state.view;
+  view.setAttribute("aria-busy", "true");
   try {
     const draw = VIEWS[state.view];
     if (state.chosen.length === 0) return empty("Choose a run in the list.");
     const content = await draw(kept);
     if (mine !== drawing) return;
     if (content) {
+      pause();
       view.replaceChildren(...content.nodes);
       view.dataset.view = state.view;
+      view.dataset.flight = "";
       if (content.after) content.after();
     }
   } catch (error) {
     if (mine === drawing) empty(error.message, "problem");
+  } finally {
+    if (mine === drawing) view.setAttribute("aria-busy", "false");
   }
 }
 
 function empty(text, kind = "hint") {
+  pause();
   view.replaceChildren(element("p", { class: kind }, text));
   view.dataset.view = "";
 }
@@ -191,8 +212,8 @@ async function curves(kept) {
   };
 }
 
-function table(titles, rows, numbersFrom = 1) {
-  const kind = (place) => (place >= numbersFrom ? "number" : "");
+function table(titles, rows, numbers) {
+  const kind = (place) => (numbers.includes(place) ? "number" : "");
   const head = element("tr", {}, ...titles.map((title, place) => element("th", { class: kind(place), scope: "col" }, title)));
   const body = rows.map((cells) => element("tr", {}, ...cells.map((cell, place) => element("td", { class: kind(place) }, cell))));
   return element("div", { class: "scroll" }, element("table", {}, element("thead", {}, head), element("tbody", {}, ...body)));
@@ -208,11 +229,17 @@ async function actors() {
       nodes.push(element("p", {}, `last 50 episodes: ${walls} walls passed, return ${reward}`));
     }
     if (run.damaged_rows > 0) nodes.push(element("p", { class: "problem" }, `episodes.csv: ${run.damaged_rows} rows cannot be read and are left out`));
-    const rows = Object.entries(run.actors).map(([actor, flown]) =>
-      [`actor ${actor}`, `${flown.episodes}`, `${flown.steps}`, flown.walls_passed.toFixed(2), `${flown.last_episode}`]);
+    const actors = [...new Set([...Object.keys(run.actors), ...Object.keys(run.activity)])].sort((one, other) => one - other);
+    const rows = actors.map((actor) => {
+      const flown = run.actors[actor];
+      const numbers = flown ? [`${flown.episodes}`, `${flown.steps}`, flown.walls_passed.toFixed(2), `${flown.last_episode}`] : ["0", "0", "", ""];
+      const log = run.activity[actor];
+      const last = log ? [ago(log.changed_secs), element("span", { class: "log" }, log.line)] : ["", "no log"];
+      return [`actor ${actor}`, ...numbers, ...last];
+    });
     nodes.push(rows.length === 0
-      ? element("p", { class: "hint" }, "No episode has ended yet.")
-      : table(["actor", "episodes", "steps", "walls passed", "its last episode"], rows));
+      ? element("p", { class: "hint" }, "No actor has begun yet.")
+      : table(["actor", "episodes", "steps", "walls passed", "its last episode", "last log line", ""], rows, [1, 2, 3, 4]));
   }
   return { nodes };
 }
@@ -232,9 +259,13 @@ async function settings() {
     element("div", { class: "scroll" }, element("table", { class: "settings" }, element("thead", {}, head), element("tbody", {}, ...rows)))] };
 }
 
-// The run whose evaluation is shown: the one that was chosen last.
+// The run whose flights are shown: the one that was chosen last.
+function lastChosen() {
+  return state.chosen[state.chosen.length - 1];
+}
+
 async function evaluated() {
-  const id = state.chosen[state.chosen.length - 1];
+  const id = lastChosen();
   const { courses } = await ask("flights", [["run", id]]);
   if (courses.length === 0) throw new Error(`${id} has no final evaluation yet.`);
   state.course = Math.min(state.course, courses.length - 1);
@@ -302,47 +333,227 @@ function wallMesh(wall) {
     i: corner(0), j: corner(1), k: corner(2), color: "#8a919c", opacity: 0.45, hoverinfo: "skip", showlegend: false, flatshading: true };
 }
 
-function wayOf(flight, upto) {
-  const points = flight.points_m.slice(0, upto + 1);
-  return { x: points.map((p) => p[0]), y: points.map((p) => p[1]), z: points.map((p) => p[2]) };
+function wayOf(points, upto) {
+  const way = points.slice(0, upto + 1);
+  return { x: way.map((p) => p[0]), y: way.map((p) => p[1]), z: way.map((p) => p[2]) };
 }
 
-async function flights() {
-  const [{ course, choice }] = await Promise.all([evaluated(), plotly()]);
-  state.flight = Math.min(state.flight, course.flights.length - 1);
-  const flight = course.flights[state.flight];
-  const last = flight.points_m.length - 1;
-  const options = course.flights.map((one, number) => [`${number}`, `${one.episode}: ${OUTCOME_NAMES[one.outcome]}`]);
-  const chosen = select("Episode", options, `${state.flight}`, (value) => { state.flight = Number(value); show(); });
-  const where = element("output", {});
-  const slider = element("input", { type: "range", min: 0, max: last, value: last, "aria-label": "step" });
+// A plot of a flight through walls. Its move(step) flies the drone to a step.
+function scene(corridor, walls, points, outcome, name) {
+  const colours = { color: OUTCOMES[outcome] };
+  const last = points.length - 1;
   const plot = element("div", { class: "plot" });
-  const way = Object.assign({ type: "scatter3d", mode: "lines", name: `episode ${flight.episode}`, line: { color: OUTCOMES[flight.outcome], width: 6 } }, wayOf(flight, last));
-  const drone = { type: "scatter3d", mode: "markers", name: "drone", marker: { color: OUTCOMES[flight.outcome], size: 7, symbol: "square" } };
-  const place = (step) => {
-    const [x, y, z] = flight.points_m[step];
-    where.textContent = ` step ${step} of ${last}: ${x.toFixed(1)} m along, ${y.toFixed(1)} m left, ${z.toFixed(1)} m up`;
-    return { x: [[x]], y: [[y]], z: [[z]] };
-  };
-  const start = place(last);
-  Object.assign(drone, { x: start.x[0], y: start.y[0], z: start.z[0] });
-  const walls = course.walls.map(wallMesh);
-  slider.addEventListener("input", () => {
-    const step = Number(slider.value);
-    const to = wayOf(flight, step);
-    const here = place(step);
-    Plotly.restyle(plot, { x: [to.x, here.x[0]], y: [to.y, here.y[0]], z: [to.z, here.z[0]] }, [walls.length, walls.length + 1]);
-  });
-  const [length, width, height] = course.corridor_m;
+  const at = (step) => wayOf([points[step]], 0);
+  const line = (more, upto) => Object.assign({ type: "scatter3d", mode: "lines", line: Object.assign({ width: 6 }, colours) }, more, wayOf(points, upto));
+  const traces = [
+    ...walls.map(wallMesh),
+    line({ opacity: 0.3, hoverinfo: "skip", showlegend: false }, last),
+    line({ name }, 0),
+    Object.assign({ type: "scatter3d", mode: "markers", name: "drone", marker: Object.assign({ size: 7, symbol: "square" }, colours) }, at(0)),
+  ];
+  const [length, width, height] = corridor;
   const axis = (title, range) => ({ title: { text: title }, range, gridcolor: colour("--line"), backgroundcolor: colour("--paper") });
-  const scene = {
+  const room = {
     xaxis: axis("along, m", [0, length]), yaxis: axis("left, m", [-width / 2, width / 2]), zaxis: axis("up, m", [0, height]),
     aspectmode: "manual", aspectratio: { x: 2.6, y: 0.7, z: 0.7 * height / width },
     camera: { eye: { x: -1.3, y: -2.0, z: 0.8 }, center: { x: -0.1, y: 0, z: -0.25 } },
   };
   return {
-    nodes: [element("div", { class: "choices" }, choice, chosen, element("label", {}, "Step ", slider, where)), plot],
-    after: () => Plotly.newPlot(plot, [...walls, way, drone], layout({ rest: { scene, margin: { l: 0, r: 0, t: 0, b: 0 } } }), CONFIG),
+    plot, last,
+    draw: () => Plotly.newPlot(plot, traces, layout({ rest: { scene: room, margin: { l: 0, r: 0, t: 0, b: 0 } } }), CONFIG),
+    move: (step) => {
+      const [way, drone] = [wayOf(points, step), at(step)];
+      Plotly.restyle(plot, { x: [way.x, drone.x], y: [way.y, drone.y], z: [way.z, drone.z] }, [walls.length + 1, walls.length + 2]);
+    },
+  };
+}
+
+// Timer that plays a flight.
+let playing = null;
+
+function pause() {
+  clearInterval(playing);
+  playing = null;
+  for (const button of document.querySelectorAll(".play")) button.textContent = "Play";
+}
+
+// Slider over the steps, and the button that plays them. Calls go(step).
+function player(last, go) {
+  const slider = element("input", { type: "range", min: 0, max: last, value: 0, "aria-label": "step" });
+  slider.addEventListener("input", () => { pause(); go(Number(slider.value)); });
+  const play = element("button", { type: "button", class: "play", onclick: () => {
+    if (playing !== null) return pause();
+    if (Number(slider.value) === last) slider.value = 0;
+    play.textContent = "Pause";
+    playing = setInterval(() => {
+      slider.value = Number(slider.value) + 1;
+      go(Number(slider.value));
+      if (Number(slider.value) === last) pause();
+    }, PLAY_PERIOD_MS);
+  } }, "Play");
+  return [play, slider];
+}
+
+async function flights(kept) {
+  const id = lastChosen();
+  const [{ recordings }] = await Promise.all([ask("recordings", [["run", id]]), plotly()]);
+  const source = select("Flights", [["recordings", `recorded (${recordings.length})`], ["evaluation", "final evaluation: positions alone"]],
+    state.source, (value) => { state.source = value; show(); });
+  if (recordings.length > 0 && state.source === "recordings") return recordedFlight(kept, id, recordings, source);
+  if (recordings.length > 0) return evaluationFlight([source]);
+  const hint = element("p", { class: "hint" }, `${id} has no recordings. A run started with --set run.record_every=50 records each 50th training episode, `
+    + "each course's first evaluation episode and those that failed, with what the camera sees and the reward.");
+  try {
+    const { nodes, after } = await evaluationFlight([]);
+    return { nodes: [hint, ...nodes], after };
+  } catch (error) {
+    return { nodes: [hint, element("p", { class: "hint" }, error.message)] };
+  }
+}
+
+async function evaluationFlight(choices) {
+  const { course, choice } = await evaluated();
+  state.flight = Math.min(state.flight, course.flights.length - 1);
+  const flight = course.flights[state.flight];
+  const options = course.flights.map((one, number) => [`${number}`, `${one.episode}: ${OUTCOME_NAMES[one.outcome]}`]);
+  const chosen = select("Episode", options, `${state.flight}`, (value) => { state.flight = Number(value); show(); });
+  const drawn = scene(course.corridor_m, course.walls, flight.points_m, flight.outcome, `episode ${flight.episode}`);
+  const where = element("output", {});
+  const say = (step) => { where.textContent = ` step ${step} of ${drawn.last}: ${place(flight.points_m[step])}`; };
+  const controls = player(drawn.last, (step) => { drawn.move(step); say(step); });
+  say(0);
+  return {
+    nodes: [element("div", { class: "choices" }, ...choices, choice, chosen), element("div", { class: "choices" }, ...controls, where), drawn.plot],
+    after: drawn.draw,
+  };
+}
+
+function place([x, y, z]) {
+  return `${x.toFixed(1)} m along, ${y.toFixed(1)} m left, ${z.toFixed(1)} m up`;
+}
+
+function picture(caption) {
+  const canvas = element("canvas", Object.assign({ class: "depth", role: "img", "aria-label": caption }, IMAGE));
+  const text = element("figcaption", {}, caption);
+  return { canvas, text, figure: element("figure", {}, canvas, text) };
+}
+
+function drawGrey(canvas, images, step) {
+  const pixels = IMAGE.width * IMAGE.height;
+  const context = canvas.getContext("2d");
+  const data = context.createImageData(IMAGE.width, IMAGE.height);
+  for (let pixel = 0; pixel < pixels; pixel++) {
+    const grey = images[step * pixels + pixel];
+    data.data.set([grey, grey, grey, 255], 4 * pixel);
+  }
+  context.putImageData(data, 0, 0);
+}
+
+// Images that the run's decoder makes of the codes; an error says why it has none.
+async function reconstruct(asked) {
+  const answer = await request("reconstructions", asked);
+  if (answer.headers.get("content-type") === "application/json") throw new Error((await answer.json()).none);
+  return new Uint8Array(await answer.arrayBuffer());
+}
+
+function rewardPlot(steps) {
+  const plot = element("div", { class: "small plot" });
+  const rewards = steps.map((step) => (step.numbers.reward || [0])[0]);
+  let sum = 0;
+  const soFar = rewards.map((reward) => (sum += reward));
+  const line = (y, name, place, more) => ({ x: rewards.map((_, step) => step), y, name, mode: "lines", line: Object.assign({ color: COLOURS[place], width: 2 }, more) });
+  const now = (step) => ({ type: "line", x0: step, x1: step, y0: 0, y1: 1, yref: "paper", line: { color: colour("--pale"), width: 1, dash: "dot" } });
+  const drawn = layout({ x: { title: { text: "step" } }, y: {}, rest: { margin: { l: 40, r: 8, t: 8, b: 36 }, shapes: [now(0)] } });
+  return {
+    plot,
+    draw: () => Plotly.newPlot(plot, [line(soFar, "return so far", 0, {}), line(rewards, "reward", 1, { dash: "dash" })], drawn, { responsive: true, displayModeBar: false }),
+    move: (step) => Plotly.relayout(plot, { shapes: [now(step)] }),
+  };
+}
+
+// Numbers of a step that a table shows: column, its title.
+const SHOWN = [["position_m", "position, m"], ["velocity_mps", "velocity, m/s"], ["action", "action: left, up"],
+  ["oracle_action", "teacher's action"], ["reward_terms", "reward terms"], ["walls_passed", "walls passed"]];
+
+function numbersTable(flight, step) {
+  const { numbers } = flight.steps[step];
+  // Without a teacher, its actions are zero.
+  const isThere = (column) => numbers[column] && (column !== "oracle_action" || flight.steps.some((one) => (one.numbers[column] || []).some((value) => value !== 0)));
+  const rows = SHOWN.filter(([column]) => isThere(column)).map(([column, title]) => [title, numbers[column].map((value) => (value ?? NaN).toFixed(2)).join("  ")]);
+  return table(["at this step", ""], rows, [1]);
+}
+
+function outcomeOf(flight) {
+  const last = flight.events.length > 0 ? flight.events[flight.events.length - 1][1] : "";
+  return { "reached the end": "reached_end", "timed out": "timed_out" }[last] || "collided";
+}
+
+function recordingTitle(name) {
+  return name.replace(/\.mcap$/, "").replaceAll("-", " ").replaceAll("_", " ").replace(/(\d+)of(\d+)$/, "$1 of $2 walls");
+}
+
+async function recordedFlight(kept, id, recordings, source) {
+  const names = recordings.map((recording) => recording.name);
+  if (!names.includes(state.recording) || state.follow) {
+    if (state.recording !== names[0]) state.episode = 0;
+    state.recording = names[0];
+  }
+  const chosen = select("Recording", names.map((name) => [name, recordingTitle(name)]), state.recording,
+    (value) => { Object.assign(state, { recording: value, episode: 0, follow: value === names[0] }); show(); });
+  chosen.className = "recording";
+  const key = JSON.stringify([id, state.recording, state.episode]);
+  if (kept && view.dataset.flight === key) {
+    view.querySelector(".recording")?.replaceWith(chosen);
+    return null;
+  }
+  const asked = [["run", id], ["name", state.recording], ["episode", `${state.episode}`]];
+  const [{ titles, flight }, depth] = await Promise.all([ask("recording", asked), askBytes("images", asked)]);
+  if (flight.steps.length === 0) throw new Error(`${state.recording} has no steps.`);
+  const choices = [source, chosen];
+  if (titles.length > 1) choices.push(select("Episode", titles.map((title, number) => [`${number}`, title]), `${state.episode}`, (value) => { state.episode = Number(value); state.follow = false; show(); }));
+  const follow = element("input", { type: "checkbox", onchange: (event) => { state.follow = event.target.checked; show(); } });
+  follow.checked = state.follow;
+  choices.push(element("label", {}, follow, " follow the newest"));
+
+  const points = flight.steps.map((step) => step.numbers.position_m);
+  const drawn = scene(flight.corridor_m, flight.walls, points, outcomeOf(flight), flight.title);
+  const [seen, coded] = [picture("depth image: brighter is farther"), picture("what the decoder makes of its latent code")];
+  const rewards = rewardPlot(flight.steps);
+  const where = element("output", {});
+  const numbers = element("div", {});
+  let reconstructed = null;
+  let now = 0;
+  const pictures = () => {
+    drawGrey(seen.canvas, depth, now);
+    if (reconstructed) drawGrey(coded.canvas, reconstructed, now);
+  };
+  const say = () => {
+    const secs = flight.steps[now].secs;
+    const event = flight.events.filter(([at]) => at <= secs + 1e-6).pop();
+    where.textContent = ` step ${now} of ${drawn.last}, ${secs.toFixed(1)} s: ${event ? event[1] : ""}`;
+    numbers.replaceChildren(numbersTable(flight, now));
+    pictures();
+  };
+  const controls = player(drawn.last, (step) => { now = step; drawn.move(step); rewards.move(step); say(); });
+  say();
+  const side = element("div", { class: "side" }, seen.figure, coded.figure, rewards.plot, numbers);
+  coded.text.textContent = "the reconstruction is being drawn";
+  return {
+    nodes: [element("div", { class: "choices" }, ...choices), element("div", { class: "choices" }, ...controls, where),
+      element("div", { class: "flight" }, drawn.plot, side)],
+    after: () => {
+      view.dataset.flight = key;
+      drawn.draw();
+      rewards.draw();
+      reconstruct(asked).then((images) => {
+        reconstructed = images;
+        coded.text.textContent = "what the newest checkpoint's decoder makes of its latent code";
+        pictures();
+      }).catch((error) => {
+        coded.canvas.remove();
+        coded.text.textContent = error.message;
+      });
+    },
   };
 }
 

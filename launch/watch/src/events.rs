@@ -1,19 +1,21 @@
 //! Curves in a run's TensorBoard files, read as they grow.
 //!
-//! Frame: length (u64), its checksum (u32), message, its checksum (u32). Field numbers are those of
-//! TensorFlow's `event.proto` and `summary.proto`.
+//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File};
-use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use prost::Message;
+use skein_run::{EventRecordError, split_event_record};
 
 /// Most points kept of a curve; then every second is dropped.
 const MOST_POINTS: usize = 4096;
-/// Longest message with a scalar. Pictures are longer, and skipped.
-const LONGEST_SCALAR: u64 = 4096;
+/// Most bytes read at once, so that a long file needs no second copy in memory.
+const AT_ONCE: u64 = 1 << 20;
+/// Longest record: many times a picture's.
+const LONGEST: usize = 16 << 20;
 
 /// A curve's point.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,37 +82,33 @@ impl Events {
 
     fn read_on(&mut self, path: &Path) -> io::Result<()> {
         let mut at = self.read.get(path).copied().unwrap_or(0);
-        let file = File::open(path)?;
+        let mut file = File::open(path)?;
         let metadata = file.metadata()?;
         if !metadata.is_file() || metadata.len() == at {
             return Ok(());
         }
-        let mut reader = BufReader::new(file);
-        reader.seek(SeekFrom::Start(at))?;
-        let mut message = Vec::new();
-        loop {
-            let mut head = [0; 12];
-            if reader.read_exact(&mut head).is_err() {
-                break;
-            }
-            let length = u64::from_le_bytes(std::array::from_fn(|place| head[place]));
-            let Some(end) = at.checked_add(length).and_then(|end| end.checked_add(16)) else {
-                break;
-            };
-            // The rest is still being written, or damaged.
-            if end > metadata.len() {
-                break;
-            }
-            if length <= LONGEST_SCALAR {
-                message.resize(length as usize + 4, 0);
-                reader.read_exact(&mut message)?;
-                if let Ok(event) = Event::decode(&message[..length as usize]) {
-                    self.take(event);
+        file.seek(SeekFrom::Start(at))?;
+        let mut bytes = Vec::new();
+        while (&file).take(AT_ONCE).read_to_end(&mut bytes)? > 0 {
+            let mut rest = bytes.as_slice();
+            let ended_by = loop {
+                match split_event_record(rest) {
+                    Ok((message, after)) => {
+                        if let Ok(event) = Event::decode(message) {
+                            self.take(event);
+                        }
+                        rest = after;
+                    }
+                    Err(error) => break error,
                 }
-            } else {
-                reader.seek(SeekFrom::Start(end))?;
+            };
+            let read = bytes.len() - rest.len();
+            at += read as u64;
+            bytes.drain(..read);
+            // Damage ends the file. A record may still be being written.
+            if ended_by != EventRecordError::Truncated || bytes.len() > LONGEST {
+                break;
             }
-            at = end;
         }
         self.read.insert(path.to_owned(), at);
         Ok(())
@@ -200,6 +198,8 @@ struct Value {
 
 #[cfg(test)]
 mod tests {
+    use skein_run::write_event_record;
+
     use super::*;
 
     fn frame(step: i64, value: f32) -> Vec<u8> {
@@ -213,9 +213,9 @@ mod tests {
                 }],
             }),
         };
-        let message = event.encode_to_vec();
-        let length = (message.len() as u64).to_le_bytes();
-        [&length[..], &[0; 4], &message, &[0; 4]].concat()
+        let mut record = Vec::new();
+        write_event_record(&mut record, &event.encode_to_vec()).unwrap();
+        record
     }
 
     #[test]

@@ -3,11 +3,14 @@
 //! It reads the files that runs leave, and nothing else: a run cannot tell whether it is watched,
 //! and nothing can be changed through the page.
 
+mod activity;
 mod catalogue;
 mod curves;
 mod episodes;
 mod evaluation;
 mod events;
+mod reconstruction;
+mod recordings;
 mod server;
 mod settings;
 
@@ -17,6 +20,7 @@ use std::process::ExitCode;
 use anyhow::Context;
 use clap::Parser;
 use skein_run::failure::with_causes;
+use skein_run::orphans::end_with_parent;
 use skein_run::signals::survive_file_size_limit;
 use skein_run::{note, show};
 
@@ -40,6 +44,9 @@ struct Arguments {
     /// Port to listen on; 0 takes any that is free.
     #[arg(long, value_name = "PORT", default_value_t = 6080)]
     port: u16,
+    /// End with the process that started this one.
+    #[arg(long)]
+    end_with_parent: bool,
 }
 
 fn main() -> ExitCode {
@@ -54,6 +61,9 @@ fn main() -> ExitCode {
 }
 
 fn watch(arguments: &Arguments) -> anyhow::Result<()> {
+    if arguments.end_with_parent {
+        end_with_parent().context("cannot end with the process that started this one")?;
+    }
     let catalogue = Catalogue::open(&arguments.folder)?;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

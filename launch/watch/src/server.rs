@@ -26,7 +26,8 @@ use tokio_stream::{Stream, StreamExt};
 
 use crate::catalogue::Catalogue;
 use crate::curves::ReadRun;
-use crate::{evaluation, settings};
+use crate::reconstruction::RunDecoder;
+use crate::{activity, evaluation, recordings, settings};
 
 /// Pause between two looks at the folder for an open page.
 const LOOK: Duration = Duration::from_secs(2);
@@ -70,6 +71,8 @@ struct Shared {
     catalogue: Catalogue,
     runs: Mutex<HashMap<String, ReadRun>>,
     plotly: String,
+    /// The decoder used last, with its run: some 20 MB.
+    decoder: Mutex<Option<(String, RunDecoder)>>,
 }
 
 fn router(catalogue: Catalogue, port: u16) -> Router {
@@ -77,6 +80,7 @@ fn router(catalogue: Catalogue, port: u16) -> Router {
         catalogue,
         runs: Mutex::default(),
         plotly: plotly_script(),
+        decoder: Mutex::default(),
     });
     Router::new()
         .route(
@@ -112,6 +116,22 @@ fn router(catalogue: Catalogue, port: u16) -> Router {
         .route(
             "/api/flights",
             get(async |state, query| answer(state, query, flights).await),
+        )
+        .route(
+            "/api/recordings",
+            get(async |state, query| answer(state, query, list_recordings).await),
+        )
+        .route(
+            "/api/recording",
+            get(async |state, query| answer(state, query, recording).await),
+        )
+        .route(
+            "/api/images",
+            get(async |state, query| answer(state, query, images).await),
+        )
+        .route(
+            "/api/reconstructions",
+            get(async |state, query| answer(state, query, reconstructions).await),
         )
         .route("/api/changes", get(changes))
         .with_state(shared)
@@ -169,15 +189,31 @@ fn is_own(headers: &HeaderMap, port: u16) -> bool {
 
 type Parameters = Vec<(String, String)>;
 
-/// Answers a request with JSON. Whatever goes wrong is an error on the page.
+/// Content of an answer.
+enum Content {
+    Json(Value),
+    /// Images, row by row.
+    Bytes(Vec<u8>),
+}
+
+impl From<Value> for Content {
+    fn from(value: Value) -> Self {
+        Self::Json(value)
+    }
+}
+
+/// Answers a request. Whatever goes wrong is an error on the page.
 async fn answer(
     State(shared): State<Arc<Shared>>,
     Query(parameters): Query<Parameters>,
-    make: fn(&Shared, &Parameters) -> anyhow::Result<Value>,
+    make: fn(&Shared, &Parameters) -> anyhow::Result<Content>,
 ) -> Response {
     let made = tokio::task::spawn_blocking(move || make(&shared, &parameters)).await;
     let (status, value) = match made {
-        Ok(Ok(value)) => (StatusCode::OK, value),
+        Ok(Ok(Content::Bytes(bytes))) => {
+            return ([(CONTENT_TYPE, "application/octet-stream")], bytes).into_response();
+        }
+        Ok(Ok(Content::Json(value))) => (StatusCode::OK, value),
         Ok(Err(error)) => (
             StatusCode::NOT_FOUND,
             json!({ "error": format!("{error:#}") }),
@@ -191,8 +227,8 @@ async fn answer(
     (status, kind, value.to_string()).into_response()
 }
 
-fn list(shared: &Shared, _: &Parameters) -> anyhow::Result<Value> {
-    Ok(json!({ "runs": shared.catalogue.runs() }))
+fn list(shared: &Shared, _: &Parameters) -> anyhow::Result<Content> {
+    Ok(json!({ "runs": shared.catalogue.runs() }).into())
 }
 
 /// Tells a page, as long as it is open, that the list of runs has changed.
@@ -218,7 +254,7 @@ async fn changes(
     Sse::new(changed).keep_alive(KeepAlive::default())
 }
 
-fn describe(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Value> {
+fn describe(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
     let id = parameter(parameters, "run")?;
     let run = shared.find(id)?;
     let text = shared.catalogue.read_text(&run.config());
@@ -235,13 +271,15 @@ fn describe(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Value> {
             "evaluation": json(run.evaluation_json()),
             "summary": json(run.summary_json()),
             "actors": read.actors(),
+            "activity": activity::of_actors(&shared.catalogue, &run),
             "latest": read.latest(),
             "damaged_rows": read.damaged(),
-        }))
+        })
+        .into())
     })
 }
 
-fn curves(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Value> {
+fn curves(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
     let name = parameter(parameters, "curve")?;
     let mut names = Vec::new();
     let mut of_runs = serde_json::Map::new();
@@ -259,12 +297,47 @@ fn curves(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Value> {
         let value = read.unwrap_or_else(|error| json!({ "error": format!("{error:#}") }));
         of_runs.insert(id.clone(), value);
     }
-    Ok(json!({ "names": names, "curves": of_runs }))
+    Ok(json!({ "names": names, "curves": of_runs }).into())
 }
 
-fn flights(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Value> {
+fn flights(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
     let run = shared.find(parameter(parameters, "run")?)?;
-    Ok(json!({ "courses": evaluation::read(&shared.catalogue, &run)? }))
+    Ok(json!({ "courses": evaluation::read(&shared.catalogue, &run)? }).into())
+}
+
+fn list_recordings(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
+    let run = shared.find(parameter(parameters, "run")?)?;
+    Ok(json!({ "recordings": recordings::list(&shared.catalogue, &run) }).into())
+}
+
+fn recording(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
+    let (file, episode) = shared.recorded(parameters)?;
+    Ok(recordings::flight(&file, episode)?.into())
+}
+
+fn images(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
+    let (file, episode) = shared.recorded(parameters)?;
+    Ok(Content::Bytes(skein_recordings::images(&file, episode)?))
+}
+
+/// Returns the images that the run's decoder makes of the latent codes of an episode.
+fn reconstructions(shared: &Shared, parameters: &Parameters) -> anyhow::Result<Content> {
+    let id = parameter(parameters, "run")?;
+    let run = shared.find(id)?;
+    let mut kept = shared
+        .decoder
+        .lock()
+        .unwrap_or_else(PoisonError::into_inner);
+    let of_run = kept.take().filter(|(other, _)| other == id);
+    let of_run = of_run.map(|(_, decoder)| decoder);
+    let decoder = match RunDecoder::newest(of_run, &shared.catalogue, &run) {
+        Ok(decoder) => decoder,
+        Err(error) => return Ok(json!({ "none": format!("{error:#}") }).into()),
+    };
+    let (file, episode) = shared.recorded(parameters)?;
+    let images = decoder.decode(&recordings::codes(&file, episode)?);
+    *kept = Some((id.to_owned(), decoder));
+    Ok(Content::Bytes(images?))
 }
 
 fn parameter<'a>(parameters: &'a Parameters, key: &str) -> anyhow::Result<&'a str> {
@@ -273,7 +346,22 @@ fn parameter<'a>(parameters: &'a Parameters, key: &str) -> anyhow::Result<&'a st
     Ok(value)
 }
 
+fn number(parameters: &Parameters, key: &str) -> anyhow::Result<usize> {
+    let value = parameter(parameters, key)?;
+    value
+        .parse()
+        .with_context(|| format!("{key} = {value:?} is no number"))
+}
+
 impl Shared {
+    /// Returns the recording and the episode in it that a request names.
+    fn recorded(&self, parameters: &Parameters) -> anyhow::Result<(Vec<u8>, usize)> {
+        let run = self.find(parameter(parameters, "run")?)?;
+        let name = parameter(parameters, "name")?;
+        let file = recordings::file(&self.catalogue, &run, name)?;
+        Ok((file, number(parameters, "episode")?))
+    }
+
     fn find(&self, id: &str) -> anyhow::Result<skein_run::RunDirectory> {
         self.catalogue
             .find(id)

@@ -242,12 +242,17 @@ impl EpisodesCsv {
         })
     }
 
-    /// Continues after the first `episodes` rows. Later rows belong to episodes whose learning was
-    /// lost, and are cut off.
+    /// Continues after the first `episodes` rows, which `each` is called with. Later rows belong to
+    /// episodes whose learning was lost, and are cut off.
     ///
     /// # Errors
     /// [`EpisodesError`] when the file does not contain episodes 0 to `episodes` - 1 in order.
-    pub fn resume(path: &Path, episodes: u64, disk: &Disk) -> Result<Self, EpisodesError> {
+    pub fn resume(
+        path: &Path,
+        episodes: u64,
+        disk: &Disk,
+        each: impl FnMut(&EpisodeRow),
+    ) -> Result<Self, EpisodesError> {
         if episodes == 0 {
             return Self::create(path, disk);
         }
@@ -260,7 +265,7 @@ impl EpisodesCsv {
             .write(true)
             .open(path)
             .map_err(io)?;
-        let end = end_of_rows(path, &file, episodes)?;
+        let end = end_of_rows(path, &file, episodes, each)?;
         file.set_len(end).map_err(io)?;
         end_line(&mut file).map_err(io)?;
         file.rewind().map_err(io)?;
@@ -318,7 +323,12 @@ fn end_line(file: &mut File) -> io::Result<()> {
 }
 
 /// Position after the first `episodes` rows, which must be episodes 0, 1, 2, …
-fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesError> {
+fn end_of_rows(
+    path: &Path,
+    file: &File,
+    episodes: u64,
+    mut each: impl FnMut(&EpisodeRow),
+) -> Result<u64, EpisodesError> {
     let content = |problem| EpisodesError::Content {
         path: path.to_owned(),
         expected: episodes,
@@ -346,6 +356,7 @@ fn end_of_rows(path: &Path, file: &File, episodes: u64) -> Result<u64, EpisodesE
                 row.episode
             )));
         }
+        each(&row);
     }
     Ok(reader.position().byte())
 }
@@ -358,6 +369,10 @@ mod tests {
 
     use super::*;
     use crate::episode::samples;
+
+    fn resume(path: &Path, episodes: u64) -> Result<EpisodesCsv, EpisodesError> {
+        EpisodesCsv::resume(path, episodes, &disk(), |_| {})
+    }
 
     fn disk() -> Disk {
         Disk::new(std::sync::Arc::default())
@@ -411,7 +426,7 @@ mod tests {
         write(&mut EpisodesCsv::create(&cut, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&cut).unwrap();
         fs::write(&cut, text.trim_end()).unwrap();
-        write(&mut EpisodesCsv::resume(&cut, 4, &disk()).unwrap(), 4..5);
+        write(&mut resume(&cut, 4).unwrap(), 4..5);
         assert_eq!(fs::read(&whole).unwrap(), fs::read(&cut).unwrap());
     }
 
@@ -422,9 +437,7 @@ mod tests {
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..4);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, text.replacen("episode,epoch", "epoch,episode", 1)).unwrap();
-        let error = EpisodesCsv::resume(&path, 2, &disk())
-            .unwrap_err()
-            .to_string();
+        let error = resume(&path, 2).unwrap_err().to_string();
         assert!(
             error.contains("episodes.csv") && error.contains("its columns are"),
             "{error}"
@@ -441,10 +454,7 @@ mod tests {
         write(&mut EpisodesCsv::create(&whole, &disk()).unwrap(), 0..30);
         for checkpoint in [0, 1, 20] {
             write(&mut EpisodesCsv::create(&resumed, &disk()).unwrap(), 0..25);
-            write(
-                &mut EpisodesCsv::resume(&resumed, checkpoint, &disk()).unwrap(),
-                checkpoint..30,
-            );
+            write(&mut resume(&resumed, checkpoint).unwrap(), checkpoint..30);
             assert_eq!(
                 fs::read(&whole).unwrap(),
                 fs::read(&resumed).unwrap(),
@@ -460,7 +470,7 @@ mod tests {
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
         let text = fs::read_to_string(&path).unwrap();
         fs::write(&path, &text[..text.len() - 7]).unwrap();
-        write(&mut EpisodesCsv::resume(&path, 4, &disk()).unwrap(), 4..5);
+        write(&mut resume(&path, 4).unwrap(), 4..5);
         assert_eq!(fs::read_to_string(&path).unwrap(), text);
     }
 
@@ -472,9 +482,7 @@ mod tests {
         let text = fs::read_to_string(&path).unwrap();
         let (whole, last) = text.trim_end().rsplit_once(',').unwrap();
         fs::write(&path, format!("{whole},\"{last}\n")).unwrap();
-        let refusal = EpisodesCsv::resume(&path, 2, &disk())
-            .unwrap_err()
-            .to_string();
+        let refusal = resume(&path, 2).unwrap_err().to_string();
         assert!(refusal.contains("episodes.csv"), "{refusal}");
     }
 
@@ -486,7 +494,7 @@ mod tests {
         write(&mut csv, 0..3);
         drop(csv);
         // Extent over two incarnations.
-        let mut csv = EpisodesCsv::resume(&path, 2, &disk()).unwrap();
+        let mut csv = resume(&path, 2).unwrap();
         write(&mut csv, 2..5);
         let extent = csv.extent();
         write(&mut csv, 5..7);
@@ -518,17 +526,13 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("episodes.csv");
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 0..5);
-        let error = EpisodesCsv::resume(&path, 6, &disk())
-            .unwrap_err()
-            .to_string();
+        let error = resume(&path, 6).unwrap_err().to_string();
         assert!(
             error.contains("episodes.csv") && error.contains("ends after 5"),
             "{error}"
         );
         write(&mut EpisodesCsv::create(&path, &disk()).unwrap(), 3..9);
-        let error = EpisodesCsv::resume(&path, 2, &disk())
-            .unwrap_err()
-            .to_string();
+        let error = resume(&path, 2).unwrap_err().to_string();
         assert!(error.contains("row 0 is episode 3"), "{error}");
     }
 }

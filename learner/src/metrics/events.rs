@@ -1,8 +1,6 @@
 //! TensorBoard event files.
 //!
-//! An event file is a sequence of framed protocol buffer messages. The two crates that write them
-//! depend on superseded protocol buffer libraries, so the few messages needed are defined here.
-//! Field numbers are those of TensorFlow's `event.proto` and `summary.proto`.
+//! An event file is a sequence of framed messages; [`super::messages`] defines them.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
@@ -13,6 +11,7 @@ use prost::Message;
 use serde::{Deserialize, Serialize};
 use skein_run::{durable, write_event_record};
 
+use super::messages::{Event, SESSION_START, SessionLog, Summary, SummaryValue, event};
 use crate::disk::{Disk, PatientWriter};
 use crate::notice::notify_user;
 
@@ -112,11 +111,20 @@ impl EventWriter {
     pub fn scalars(&mut self, step: u64, values: &[(&str, f64)]) -> Result<(), EventError> {
         let value = values
             .iter()
-            .map(|&(tag, value)| SummaryValue {
-                tag: tag.to_owned(),
-                simple_value: Some(value as f32),
-            })
+            .map(|&(tag, value)| SummaryValue::scalar(tag, value))
             .collect();
+        self.write(step, event::What::Summary(Summary { value }))
+    }
+
+    /// Appends values other than scalars at `step`.
+    ///
+    /// # Errors
+    /// [`EventError`].
+    pub(super) fn summary(
+        &mut self,
+        step: u64,
+        value: Vec<SummaryValue>,
+    ) -> Result<(), EventError> {
         self.write(step, event::What::Summary(Summary { value }))
     }
 
@@ -239,57 +247,11 @@ fn cut_back(directory: &Path, files: &[EventFile]) -> Result<Option<CreationStam
         .max())
 }
 
-fn now_secs() -> f64 {
+pub(super) fn now_secs() -> f64 {
     SystemTime::now()
         .duration_since(UNIX_EPOCH)
         .map_or(0.0, |elapsed| elapsed.as_secs_f64())
 }
-
-#[derive(Clone, PartialEq, Message)]
-struct Event {
-    /// Seconds since 1970.
-    #[prost(double, tag = "1")]
-    wall_time: f64,
-    #[prost(int64, tag = "2")]
-    step: i64,
-    #[prost(oneof = "event::What", tags = "3, 5, 7")]
-    what: Option<event::What>,
-}
-
-mod event {
-    #[derive(Clone, PartialEq, prost::Oneof)]
-    pub(super) enum What {
-        #[prost(string, tag = "3")]
-        FileVersion(String),
-        #[prost(message, tag = "5")]
-        Summary(super::Summary),
-        #[prost(message, tag = "7")]
-        SessionLog(super::SessionLog),
-    }
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct Summary {
-    #[prost(message, repeated, tag = "1")]
-    value: Vec<SummaryValue>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct SummaryValue {
-    #[prost(string, tag = "1")]
-    tag: String,
-    #[prost(float, optional, tag = "2")]
-    simple_value: Option<f32>,
-}
-
-#[derive(Clone, PartialEq, Message)]
-struct SessionLog {
-    #[prost(int32, tag = "1")]
-    status: i32,
-}
-
-/// Value of `SessionLog.SessionStatus.START`.
-const SESSION_START: i32 = 1;
 
 /// Reads back what was written.
 #[cfg(test)]
@@ -309,18 +271,16 @@ pub(super) mod testing {
         Ok(events)
     }
 
-    /// Every point: its tag, its step, and the bits of its value.
+    /// Every point of a curve: its tag, its step, and the bits of its value.
     pub(in super::super) fn points(bytes: &[u8]) -> Vec<(String, i64, u32)> {
         let mut points = Vec::new();
         for event in read_records(bytes).unwrap() {
             if let Some(event::What::Summary(summary)) = event.what {
-                let bits = |value: &SummaryValue| value.simple_value.unwrap().to_bits();
-                points.extend(
-                    summary
-                        .value
-                        .iter()
-                        .map(|value| (value.tag.clone(), event.step, bits(value))),
-                );
+                let point = |value: &SummaryValue| {
+                    let bits = value.simple_value?.to_bits();
+                    Some((value.tag.clone(), event.step, bits))
+                };
+                points.extend(summary.value.iter().filter_map(point));
             }
         }
         points
@@ -360,10 +320,7 @@ mod tests {
             .iter()
             .map(|event| event.what.clone().unwrap())
             .collect();
-        let value = |tag: &str, value| SummaryValue {
-            tag: tag.to_owned(),
-            simple_value: Some(value),
-        };
+        let value = SummaryValue::scalar;
         assert_eq!(
             what,
             [

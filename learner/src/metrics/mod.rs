@@ -8,12 +8,17 @@
 mod episodes;
 mod events;
 mod faults;
+mod messages;
+mod pictures;
 mod scalars;
 mod window;
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use skein_protocol::config::Config;
+use skein_protocol::evaluation::EvaluationReport;
+use skein_protocol::transition::Outcome;
 use skein_protocol::{REWARD_TERM_NAMES, REWARD_TERMS};
 use skein_run::RunDirectory;
 
@@ -25,6 +30,12 @@ pub use events::{EventError, EventFile, EventWriter};
 pub use faults::fault_points;
 pub use scalars::Scalar;
 pub use window::MovingAverage;
+
+use messages::SummaryValue;
+
+/// Folder of curves over environment steps, within that of the curves over episodes. TensorBoard
+/// shows it as a run of its own.
+const OVER_STEPS: &str = "over_steps";
 
 /// Averages over the latest training episodes; part of a checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -95,7 +106,13 @@ pub struct Metrics {
     rows: u64,
     episodes: EpisodesCsv,
     events: EventWriter,
+    /// The windows' curves over environment steps.
+    events_over_steps: EventWriter,
+    /// Environment steps of all rows.
+    steps: u64,
     windows: EpisodeWindows,
+    /// Episodes of the window that reached the end: 1 or 0. Read from the rows when a run resumes.
+    successes: MovingAverage,
 }
 
 /// Reason why metrics cannot be written.
@@ -107,6 +124,9 @@ pub enum MetricsError {
     /// Error of the event file.
     #[error(transparent)]
     Events(#[from] EventError),
+    /// A picture cannot be encoded.
+    #[error("cannot draw a picture for TensorBoard: {0}")]
+    Picture(#[from] png::EncodingError),
 }
 
 impl Metrics {
@@ -128,13 +148,101 @@ impl Metrics {
             events,
             windows,
         } = state;
+        let prefix = format!("{OVER_STEPS}/");
+        let (over_steps, events): (Vec<_>, Vec<_>) = events
+            .into_iter()
+            .partition(|file| file.name.starts_with(&prefix));
+        let over_steps = over_steps.into_iter().map(|file| EventFile {
+            name: file.name.replacen(&prefix, "", 1),
+            ..file
+        });
+        let mut successes = MovingAverage::new(windows.total_reward.window());
+        let mut steps = 0;
+        let episodes_csv = EpisodesCsv::resume(&run.episodes_csv(), episodes, disk, |row| {
+            steps += row.steps as u64;
+            successes.push(success(row.outcome));
+        })?;
+        let tensorboard = run.tensorboard();
+        let folder = tensorboard.join(OVER_STEPS);
         Ok(Self {
             run: run.clone(),
             rows: episodes,
-            episodes: EpisodesCsv::resume(&run.episodes_csv(), episodes, disk)?,
-            events: EventWriter::resume(&run.tensorboard(), events, episodes, disk)?,
+            episodes: episodes_csv,
+            events: EventWriter::resume(&tensorboard, events, episodes, disk)?,
+            events_over_steps: EventWriter::resume(&folder, over_steps.collect(), steps, disk)?,
+            steps,
             windows,
+            successes,
         })
+    }
+
+    /// Describes the run to TensorBoard: its configuration as text, and the settings that differ
+    /// from the defaults as hyperparameters.
+    ///
+    /// # Errors
+    /// [`MetricsError`] names the file.
+    pub fn describe(&mut self, config: &Config) -> Result<(), MetricsError> {
+        let curves = [
+            Scalar::WindowReturn,
+            Scalar::WindowWallsPassed,
+            Scalar::WindowSuccessRate,
+            Scalar::EvaluationWallsPassed,
+        ];
+        let changed = config.changed_settings();
+        let curves = curves.map(Scalar::tag);
+        let mut values = Vec::from(SummaryValue::hyperparameters(
+            &changed,
+            &curves,
+            events::now_secs(),
+        ));
+        let toml = format!("```toml\n{}```\n", config.to_toml());
+        values.push(SummaryValue::text("configuration", toml));
+        Ok(self.events.summary(self.rows, values)?)
+    }
+
+    /// Adds depth images above their reconstructions, `[n, 72, 128]` each, at training episode
+    /// `episode`.
+    ///
+    /// # Errors
+    /// [`MetricsError`] names the file.
+    pub fn reconstructions(
+        &mut self,
+        episode: u64,
+        depth: &[u8],
+        reconstruction: &[u8],
+    ) -> Result<(), MetricsError> {
+        let picture = pictures::above_each_other(depth, reconstruction)?;
+        let value = SummaryValue::picture(pictures::TAG, picture.size, picture.png);
+        Ok(self.events.summary(episode, vec![value])?)
+    }
+
+    /// Appends a point to each course's curves, `evaluation/COURSE/…`, at training episode
+    /// `episode`.
+    ///
+    /// # Errors
+    /// [`MetricsError`] names the file.
+    pub fn evaluation(
+        &mut self,
+        episode: u64,
+        report: &EvaluationReport,
+    ) -> Result<(), MetricsError> {
+        let points: Vec<(String, f64)> = report
+            .courses
+            .iter()
+            .flat_map(|course| {
+                let tag = |what: &str| format!("evaluation/{}/{what}", course.course);
+                [
+                    (tag("walls_passed_rate"), course.r),
+                    (tag("completed"), course.completed),
+                    (tag("return"), course.mean_return),
+                ]
+            })
+            .collect();
+        let points: Vec<_> = points
+            .iter()
+            .map(|(tag, value)| (tag.as_str(), *value))
+            .collect();
+        Ok(self.events.scalars(episode, &points)?)
     }
 
     /// Returns the present extent. It holds for the files once they are [flushed](Metrics::flush).
@@ -142,7 +250,7 @@ impl Metrics {
         MetricsState {
             episodes: self.rows,
             episodes_extent: self.episodes.extent(),
-            events: self.events.files().to_vec(),
+            events: self.event_files(),
             windows: self.windows.clone(),
         }
     }
@@ -150,15 +258,27 @@ impl Metrics {
     /// Files on whose content a checkpoint of the [state](Metrics::state) relies.
     pub fn files(&self) -> Vec<PathBuf> {
         let folder = self.run.tensorboard();
-        let events = self
-            .events
-            .files()
-            .iter()
-            .map(|file| folder.join(&file.name));
+        let events = self.event_files();
+        let events = events.iter().map(|file| folder.join(&file.name));
         // A lost file cannot be relied on.
         let events = events.filter(|path| path.exists());
         std::iter::once(self.run.episodes_csv())
             .chain(events)
+            .collect()
+    }
+
+    /// Returns the event files with their lengths; names are relative to the folder of the curves.
+    fn event_files(&self) -> Vec<EventFile> {
+        let over_steps = self.events_over_steps.files().iter();
+        let over_steps = over_steps.map(|file| EventFile {
+            name: format!("{OVER_STEPS}/{}", file.name),
+            bytes: file.bytes,
+        });
+        self.events
+            .files()
+            .iter()
+            .cloned()
+            .chain(over_steps)
             .collect()
     }
 
@@ -180,16 +300,16 @@ impl Metrics {
             (Scalar::Steps.tag(), row.steps as f64),
         ];
         points.extend(terms.iter().map(|(tag, part)| (tag.as_str(), *part)));
-        points.extend([
-            (
-                Scalar::WindowReturn.tag(),
-                window(&self.windows.total_reward),
-            ),
-            (
-                Scalar::WindowWallsPassed.tag(),
-                window(&self.windows.walls_passed),
-            ),
-        ]);
+        self.successes.push(success(row.outcome));
+        self.steps += row.steps as u64;
+        let means = [
+            (Scalar::WindowReturn, &self.windows.total_reward),
+            (Scalar::WindowWallsPassed, &self.windows.walls_passed),
+            (Scalar::WindowSuccessRate, &self.successes),
+        ]
+        .map(|(scalar, average)| (scalar.tag(), window(average)));
+        self.events_over_steps.scalars(self.steps, &means)?;
+        points.extend(means);
         Ok(self.events.scalars(row.episode, &points)?)
     }
 
@@ -212,6 +332,7 @@ impl Metrics {
     /// [`MetricsError`] names the file.
     pub fn flush(&mut self) -> Result<(), MetricsError> {
         self.episodes.flush()?;
+        self.events_over_steps.flush()?;
         Ok(self.events.flush()?)
     }
 
@@ -219,6 +340,11 @@ impl Metrics {
     pub fn windows(&self) -> &EpisodeWindows {
         &self.windows
     }
+}
+
+/// Returns 1 for an episode that reached the end.
+fn success(outcome: Outcome) -> f32 {
+    f32::from(u8::from(outcome == Outcome::ReachedEnd))
 }
 
 /// Returns the part of each reward term in the return, with its curve's name.
@@ -231,8 +357,6 @@ fn reward_parts(steps: &[[f32; REWARD_TERMS]]) -> [(String, f64); REWARD_TERMS] 
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::transition::Outcome;
-
     use super::*;
     use crate::episode::samples;
 
@@ -244,7 +368,11 @@ mod tests {
 
     fn feed(metrics: &mut Metrics, episodes: std::ops::Range<u64>) {
         for number in episodes {
-            let mut episode = samples::episode(number, 4, Outcome::Collided);
+            let outcome = match number % 3 {
+                0 => Outcome::ReachedEnd,
+                _ => Outcome::Collided,
+            };
+            let mut episode = samples::episode(number, 4, outcome);
             episode.walls_passed = (number % 4) as u8;
             metrics.episode(&episode).unwrap();
         }
@@ -262,10 +390,13 @@ mod tests {
     /// Every point of every curve, ordered by tag and step.
     fn points(run: &RunDirectory) -> Vec<(String, i64, u32)> {
         let mut points = Vec::new();
-        for entry in std::fs::read_dir(run.tensorboard()).unwrap() {
-            points.extend(events::testing::points(
-                &std::fs::read(entry.unwrap().path()).unwrap(),
-            ));
+        for folder in [run.tensorboard(), run.tensorboard().join(OVER_STEPS)] {
+            let entries = std::fs::read_dir(folder).unwrap();
+            let paths = entries.map(|entry| entry.unwrap().path());
+            for file in paths.filter(|path| path.is_file()) {
+                let bytes = std::fs::read(file).unwrap();
+                points.extend(events::testing::points(&bytes));
+            }
         }
         points.sort();
         points
@@ -290,12 +421,17 @@ mod tests {
         feed(&mut last, 12..20);
 
         assert_eq!(last.windows(), whole.windows());
+        assert_eq!((last.steps, &last.successes), (80, &whole.successes));
         assert_eq!(whole.windows().walls_passed.mean(), Some(9.0 / 5.0));
         let read = |run: &RunDirectory| std::fs::read_to_string(run.episodes_csv()).unwrap();
         assert_eq!(read(&resumed_run), read(&whole_run));
         assert_eq!(read(&whole_run).lines().count(), 21);
         assert_eq!(points(&resumed_run), points(&whole_run));
-        assert_eq!(last.files().len(), 3, "episodes.csv, and two event files");
+        assert_eq!(
+            last.files().len(),
+            5,
+            "episodes.csv, and two event files for each axis"
+        );
     }
 
     #[test]
@@ -328,8 +464,8 @@ mod tests {
         assert_eq!(std::fs::read_to_string(run.episodes_csv()).unwrap(), "");
         assert_eq!(
             std::fs::read_dir(run.tensorboard()).unwrap().count(),
-            2,
-            "the new file, and the foreign one"
+            3,
+            "the new file, the folder of curves over steps, and the foreign file"
         );
     }
 
@@ -342,7 +478,7 @@ mod tests {
         std::fs::remove_dir_all(run.tensorboard()).unwrap();
         let mut second = metrics(&run, state);
         feed(&mut second, 3..6);
-        assert_eq!(second.files().len(), 2);
-        assert_eq!(points(&run).len(), 3 * (5 + REWARD_TERMS));
+        assert_eq!(second.files().len(), 3);
+        assert_eq!(points(&run).len(), 3 * (6 + 3 + REWARD_TERMS));
     }
 }

@@ -33,6 +33,8 @@ scalars! {
     WindowReturn => "window/return",
     /// Walls passed, averaged over the window. The paper's Fig. 10.
     WindowWallsPassed => "window/walls_passed",
+    /// Share of the window's episodes that reached the end.
+    WindowSuccessRate => "window/success_rate",
     /// Half the squared error of the two Q outputs against their target. It rises with the returns:
     /// use it to detect divergence, not progress.
     CriticLoss => "policy/critic_loss",
@@ -49,6 +51,23 @@ scalars! {
     /// Mean of the smaller Q output on the minibatches: the discounted return that the critic
     /// expects, with SAC including the entropy bonus.
     MeanValue => "policy/mean_value",
+    /// SAC: smallest of both Q outputs on a minibatch. Values far below any return mean that the
+    /// critic diverges.
+    SmallestValue => "policy/smallest_value",
+    /// SAC: largest of both Q outputs on a minibatch.
+    LargestValue => "policy/largest_value",
+    /// SAC: Euclidean norm of the critic's gradient.
+    CriticGradient => "gradient_norm/critic",
+    /// SAC: Euclidean norm of the policy's gradient.
+    PolicyGradient => "gradient_norm/policy",
+    /// The policy's learning rate.
+    PolicyLearningRate => "learning_rate/policy",
+    /// The critic's learning rate.
+    CriticLearningRate => "learning_rate/critic",
+    /// SAC: the temperature's learning rate.
+    TemperatureLearningRate => "learning_rate/temperature",
+    /// The VAE's learning rate.
+    VaeLearningRate => "learning_rate/vae",
     /// The VAE's loss: squared error summed over an image's pixels, plus the weighted divergence.
     VaeLoss => "vae/loss",
     /// Mean squared error of a reconstructed pixel, depth in [0, 1].

@@ -23,6 +23,11 @@ impl MovingAverage {
         }
     }
 
+    /// Number of values that it is over, once it is full.
+    pub fn window(&self) -> usize {
+        self.window
+    }
+
     /// `true` if it is over `window` values and holds no more than that. An average read from a
     /// file may be invalid.
     pub fn is_over(&self, window: usize) -> bool {

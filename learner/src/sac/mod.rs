@@ -14,12 +14,16 @@ pub use native::NativeSac;
 pub use torch::TorchSac;
 
 /// Metrics that an update reports. The temperature is the value before the update.
-const REPORTED: [Scalar; 5] = [
+const REPORTED: [Scalar; 9] = [
     Scalar::CriticLoss,
     Scalar::PolicyLoss,
     Scalar::Temperature,
     Scalar::Entropy,
     Scalar::MeanValue,
+    Scalar::SmallestValue,
+    Scalar::LargestValue,
+    Scalar::CriticGradient,
+    Scalar::PolicyGradient,
 ];
 
 /// Pairs `values`, in the order of [`REPORTED`], and the distance to the teacher, if there is one,

@@ -156,13 +156,13 @@ impl NativeSac {
     /// loss = ½ Σ (Q(s, replayed action) - y)², mean over the batch       (eq. 5)
     /// ```
     ///
-    /// Returns the loss and the mean of the smaller estimate.
+    /// Returns the loss, the mean of the smaller estimate, and the smallest and largest of all.
     fn critic_gradient(
         &mut self,
         team: &mut Team,
         columns: Columns<'_>,
         temperature: f32,
-    ) -> [f32; 2] {
+    ) -> [f32; 4] {
         let UpdateBuffers {
             rows,
             sample,
@@ -182,6 +182,7 @@ impl NativeSac {
         let critic = &self.critic_parameters.values;
         self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut value) = (0.0, 0.0);
+        let (mut smallest, mut largest) = (f32::INFINITY, f32::NEG_INFINITY);
         let share = 1.0 / *rows as f32;
         let grad = &mut critic_grad.values;
         for row in 0..*rows {
@@ -195,11 +196,14 @@ impl NativeSac {
                 *grad = error * share;
             }
             value += f64::from(smaller(values));
+            smallest = values.iter().copied().fold(smallest, f32::min);
+            largest = values.iter().copied().fold(largest, f32::max);
         }
         let into = &mut self.critic_parameters.gradient;
         self.critic
             .gradient(team, critic, joined, activations, critic_grad, into);
-        [loss, value].map(|sum| (sum / *rows as f64) as f32)
+        let [loss, value] = [loss, value].map(|sum| (sum / *rows as f64) as f32);
+        [loss, value, smallest, largest]
     }
 
     /// Computes the policy's gradient: makes actions of higher value likelier, at a price for lost
@@ -294,21 +298,23 @@ impl NativeSac {
     }
 
     /// Checks that the reported values and the gradients are finite; for a gradient, that its
-    /// squared norm is.
-    fn check(&self, reported: [f32; 5]) -> Result<(), UpdateError> {
+    /// squared norm is. Returns the norms of the critic's and the policy's.
+    fn check(&self, reported: [f32; 5]) -> Result<[f32; 2], UpdateError> {
         let [critic_loss, policy_loss, temperature, entropy, mean_value] = reported;
         let norm = |learned: &Learned| squared_norm(self.isa, &learned.gradient);
+        let norms = [norm(&self.critic_parameters), norm(&self.policy_parameters)];
         let numbers = [
             ("critic loss", critic_loss),
             ("policy loss", policy_loss),
             ("temperature", temperature),
             ("entropy", entropy),
             ("mean value", mean_value),
-            ("critic gradient", norm(&self.critic_parameters)),
-            ("policy gradient", norm(&self.policy_parameters)),
+            ("critic gradient", norms[0]),
+            ("policy gradient", norms[1]),
             ("temperature gradient", norm(&self.log_temperature)),
         ];
-        must_be_finite(self.updates() + 1, numbers)
+        must_be_finite(self.updates() + 1, numbers)?;
+        Ok(norms.map(f32::sqrt))
     }
 
     /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
@@ -343,20 +349,32 @@ impl Algorithm for NativeSac {
         }
         let temperature = exp(self.log_temperature.values[0]);
         self.draw(team, columns, noise);
-        let [critic_loss, mean_value] = self.critic_gradient(team, columns, temperature);
+        let [critic_loss, mean_value, smallest, largest] =
+            self.critic_gradient(team, columns, temperature);
         let ([policy_loss, log_prob], distance) = self.policy_gradient(team, columns, temperature);
         // The derivative of -α (log π + H̄) by log α is the expression itself (eq. 18). The
         // temperature rises while the entropy is below its target, and falls otherwise.
         self.log_temperature.gradient[0] = -temperature * (log_prob + self.target_entropy);
 
-        let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
-        self.check(metrics)?;
+        let [critic_norm, policy_norm] =
+            self.check([critic_loss, policy_loss, temperature, -log_prob, mean_value])?;
         let isa = self.isa;
         self.critic_parameters.step(team, isa);
         self.policy_parameters.step(team, isa);
         self.log_temperature.step(team, isa);
         let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
         follow(team, isa, target, critic, self.target_rate);
+        let metrics = [
+            critic_loss,
+            policy_loss,
+            temperature,
+            -log_prob,
+            mean_value,
+            smallest,
+            largest,
+            critic_norm,
+            policy_norm,
+        ];
         Ok(reported(metrics, distance))
     }
 

@@ -197,6 +197,10 @@ impl Algorithm for TorchSac {
                 ("temperature", &temperature.squeeze()),
                 ("entropy", &-log_prob.mean(None)),
                 ("mean value", &values.amin(1, false).mean(None)),
+                ("smallest value", &values.min()),
+                ("largest value", &values.max()),
+                ("critic gradient", &critic_gradient.norm()),
+                ("policy gradient", &policy_gradient.norm()),
             ],
             [
                 ("critic gradient", &critic_gradient),

@@ -16,7 +16,7 @@ use crate::checkpoint::{BestSnapshot, EpisodeWalls};
 use crate::curriculum;
 use crate::episode::CommittedEpisode;
 use crate::episodes::assembly::KeptData;
-use crate::evaluation;
+use crate::evaluation::{self, EvaluationWriteError};
 use crate::metrics::Scalar;
 
 impl Training<'_> {
@@ -217,9 +217,19 @@ impl Training<'_> {
         )?;
         let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
         die_if_armed(FaultPoint::LearnerEvaluated);
-        Ok(self.disk.with_room(self.directory.root(), || {
-            evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
-            evaluation::write_reconstructions(self.directory, &mut self.trainer, &pictured)
-        })?)
+        let (report, pictures) = self.disk.with_room(self.directory.root(), || {
+            let report =
+                evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
+            let trainer = &mut self.trainer;
+            let pictures = evaluation::write_reconstructions(self.directory, trainer, &pictured)?;
+            Ok::<_, EvaluationWriteError>((report, pictures))
+        })?;
+        self.metrics.evaluation(self.last_episode(), &report)?;
+        if let Some(pictures) = pictures {
+            let episode = self.last_episode();
+            self.metrics
+                .reconstructions(episode, &pictures.depth, &pictures.reconstruction)?;
+        }
+        Ok(())
     }
 }

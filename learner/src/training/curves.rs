@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use skein_protocol::config::{AlgorithmName, Config};
+
 use crate::faults::Faults;
 use crate::metrics::{Scalar, fault_points};
 use crate::replay::Replay;
@@ -23,9 +25,10 @@ pub(super) struct EpochCurves {
 }
 
 impl EpochCurves {
-    /// Returns the points of an epoch that took `duration`.
+    /// Returns the points of an epoch of a run of `config`, which took `duration`.
     pub(super) fn points(
         self,
+        config: &Config,
         duration: Duration,
         replay: &Replay,
         faults: &Faults,
@@ -44,15 +47,39 @@ impl EpochCurves {
                 (Scalar::VaeLoss, vae.loss.into()),
                 (Scalar::VaePixelError, vae.pixel_error.into()),
                 (Scalar::VaeDivergence, vae.divergence.into()),
+                (Scalar::VaeLearningRate, config.vae.learning_rate),
             ]);
         }
         if self.updates > 0 {
             points.extend(self.policy.finish());
+            points.extend(learning_rates(config));
             points.push((
                 Scalar::UpdatesPerSec,
                 self.updates as f64 / self.updating.as_secs_f64(),
             ));
         }
         points
+    }
+}
+
+/// Returns the learning rates of the configured algorithm.
+fn learning_rates(config: &Config) -> Vec<(Scalar, f64)> {
+    let (sac, td3) = (&config.sac, &config.td3);
+    match config.learning.algorithm {
+        AlgorithmName::Sac => vec![
+            (Scalar::PolicyLearningRate, sac.policy_learning_rate),
+            (Scalar::CriticLearningRate, sac.critic_learning_rate),
+            (
+                Scalar::TemperatureLearningRate,
+                sac.temperature_learning_rate,
+            ),
+        ],
+        AlgorithmName::Td3 => vec![
+            (Scalar::PolicyLearningRate, td3.policy_learning_rate),
+            (Scalar::CriticLearningRate, td3.critic_learning_rate),
+        ],
+        AlgorithmName::Distill => {
+            vec![(Scalar::PolicyLearningRate, config.distill.learning_rate)]
+        }
     }
 }

@@ -85,7 +85,8 @@ impl<'a> Training<'a> {
         if resumes > 0 && saved.episodes == 0 {
             notify_user("there is no checkpoint yet: starting from the first episode");
         }
-        let metrics = resume_metrics(directory, &saved, &disk)?;
+        let mut metrics = resume_metrics(directory, &saved, &disk)?;
+        metrics.describe(config)?;
         let mut training = Self {
             config,
             identity,

@@ -6,6 +6,7 @@
 //! codes, so that all codes in its replay come from the same arithmetic. A [`Network`] is immutable
 //! and shared between threads; each thread writes to its own [`Scratch`], allocated once.
 
+mod decoder;
 mod encoder;
 mod linear;
 mod policy;
@@ -17,6 +18,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::{IMAGE_PIXELS, LatentCode};
 
+pub use decoder::Decoder;
 pub use encoder::{Encoder, EncoderScratch};
 pub use policy::{ActionDistribution, Policy, PolicyScratch};
 

@@ -75,6 +75,8 @@ impl RunDirectory {
         reconstructions => "reconstructions.safetensors",
         /// [`RunSummary`](skein_protocol::summary::RunSummary).
         summary_json => "summary.json",
+        /// Recorded episodes, MCAP files, if the run records any.
+        recordings => "recordings",
         /// PNG files.
         plots => "plots",
     }

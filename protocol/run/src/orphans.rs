@@ -6,6 +6,14 @@ use std::process::Command;
 
 use rustix::process::{Signal, getppid, set_parent_process_death_signal};
 
+/// Makes the kernel end this process when the one that started it ends.
+///
+/// # Errors
+/// If the kernel refuses.
+pub fn end_with_parent() -> io::Result<()> {
+    Ok(set_parent_process_death_signal(Some(Signal::TERM))?)
+}
+
 /// Makes the kernel send `signal` to the process that `command` starts when the *thread* that
 /// started it ends, however that happens. If the parent has already died, the process does not
 /// start.

@@ -225,6 +225,18 @@ impl Config {
         self.validate_encoder()?;
         self.validate_teacher()?;
         self.validate_start()?;
+        if let Some(every) = self.run.record_every {
+            require(
+                !self.learning.in_segments(),
+                "run.record_every",
+                every,
+                format!(
+                    "does not go with learning.segment_steps = {}: no actor has all records of \
+                    an episode; leave it out, or set learning.segment_steps to 0",
+                    self.learning.segment_steps
+                ),
+            )?;
+        }
         let (key, batch_size) = self.batch_size_by_key();
         require(
             batch_size <= self.learning.warmup_steps.max(1),

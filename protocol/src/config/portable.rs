@@ -42,6 +42,17 @@ impl Config {
             .then_some(shorter.run.episodes)
     }
 
+    /// Returns the settings that differ from the defaults, in TOML's notation by their full keys.
+    pub fn changed_settings(&self) -> BTreeMap<String, String> {
+        let values = |config: &Self| {
+            flat(&toml::from_str(&config.portable()).expect("what was written as TOML is TOML"))
+        };
+        let defaults = values(&Self::default());
+        let mut changed = values(self);
+        changed.retain(|key, value| defaults.get(key) != Some(value));
+        changed
+    }
+
     /// Returns the keys in which `other`, the portable text of another configuration, differs from
     /// this one: for each key `section.key = value there, value here`.
     ///
@@ -119,6 +130,23 @@ mod tests {
                 format!("sac.discount = 0.5 there, {} here", here.sac.discount),
                 "simulator.vehicle.preset = \"point\" there, nothing here".to_owned()
             ]
+        );
+    }
+
+    #[test]
+    fn only_settings_that_differ_from_the_defaults_are_changed() {
+        let mut config = Config::default();
+        assert!(config.changed_settings().is_empty());
+        config.sac.discount = 0.5;
+        config.run.record_every = Some(7);
+        let changed = config.changed_settings();
+        let changed: Vec<_> = changed
+            .iter()
+            .map(|(key, value)| (key.as_str(), value.as_str()))
+            .collect();
+        assert_eq!(
+            changed,
+            [("run.record_every", "7"), ("sac.discount", "0.5")]
         );
     }
 

@@ -27,6 +27,13 @@ pub struct RunSection {
     /// Threads of the learner's networks, 1 to 256. With `libtorch` the count changes the order of
     /// sums and thus the result; with `native` it does not. Default 2.
     pub learner_threads: usize,
+    /// Records training episodes whose number is a multiple of this, at least 1, as MCAP files in
+    /// `recordings/`; also, of confirmations and the final evaluation, each course's first episode
+    /// and those that failed. The newest 200, of at most 256 MiB, are kept. Results do not depend
+    /// on it. Default: nothing is recorded. Needs episodes flown whole:
+    /// `learning.segment_steps = 0`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub record_every: Option<u64>,
 }
 
 impl Default for RunSection {
@@ -37,6 +44,7 @@ impl Default for RunSection {
             device: Device::Cpu,
             engine: None,
             learner_threads: 2,
+            record_every: None,
         }
     }
 }
@@ -72,6 +80,12 @@ impl RunSection {
                 \"libtorch\", or run.device to \"cpu\"",
                 self.device
             ),
+        )?;
+        require(
+            self.record_every != Some(0),
+            "run.record_every",
+            0,
+            "is below 1: leave it out to record nothing",
         )?;
         require(
             (1..=256).contains(&self.learner_threads),

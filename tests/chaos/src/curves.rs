@@ -49,7 +49,11 @@ pub fn read_curves(folder: &Path) -> Result<Curves, CurvesError> {
     };
     let mut files = Vec::new();
     for entry in fs::read_dir(folder).map_err(at(folder))? {
-        files.push(entry.map_err(at(folder))?.path());
+        let path = entry.map_err(at(folder))?.path();
+        // The curves over environment steps lie in a folder of their own.
+        if !path.is_dir() {
+            files.push(path);
+        }
     }
     // TensorBoard reads files in this order.
     files.sort();

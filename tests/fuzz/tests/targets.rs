@@ -190,4 +190,5 @@ drive! {
     no_report_file_panics_its_reader => "report_files",
     no_report_file_panics_the_plots => "report_pictures",
     no_event_file_panics_its_reader => "curves",
+    no_recording_panics_its_reader => "recording",
 }

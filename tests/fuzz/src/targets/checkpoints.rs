@@ -309,7 +309,7 @@ fn episodes_csv(bytes: &[u8]) -> ReaderDecision {
     let episodes = u64::from(episodes);
     with_files(&[("episodes.csv", content)], |folder| {
         let path = folder.join("episodes.csv");
-        let mut csv = match EpisodesCsv::resume(&path, episodes, &DISK) {
+        let mut csv = match EpisodesCsv::resume(&path, episodes, &DISK, |_| {}) {
             Ok(csv) => csv,
             Err(error) => {
                 assert!(error.to_string().contains("episodes.csv"), "{error}");
@@ -318,7 +318,7 @@ fn episodes_csv(bytes: &[u8]) -> ReaderDecision {
         };
         csv.write(&row(episodes)).unwrap();
         csv.flush().unwrap();
-        EpisodesCsv::resume(&path, episodes + 1, &DISK).unwrap();
+        EpisodesCsv::resume(&path, episodes + 1, &DISK, |_| {}).unwrap();
         ReaderDecision::Accepted
     })
 }

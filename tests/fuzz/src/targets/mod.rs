@@ -3,6 +3,7 @@
 mod checkpoints;
 mod configuration;
 mod courses;
+mod recordings;
 mod records;
 mod replay;
 mod reports;
@@ -66,7 +67,7 @@ impl Target {
 const USUAL: usize = 200;
 
 /// All targets.
-pub static TARGETS: [Target; 24] = [
+pub static TARGETS: [Target; 25] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -91,6 +92,7 @@ pub static TARGETS: [Target; 24] = [
     reports::FILES,
     reports::PICTURES,
     reports::CURVES,
+    recordings::FILE,
 ];
 
 /// Returns a file of the repository, by its path from the root.

@@ -1,17 +1,17 @@
 //! Foxglove's messages, as far as recordings use them, in Protobuf's encoding.
 //!
-//! Source of names and numbers: the schemas in `launch/evaluate/schemas/`.
+//! Source of names and numbers: the schemas in `actor/recordings/schemas/`.
 
 use prost::{Enumeration, Message};
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH};
 
-pub(super) const WORLD: &str = "world";
-pub(super) const BODY: &str = "body";
-pub(super) const CAMERA: &str = "camera";
+pub(crate) const WORLD: &str = "world";
+pub(crate) const BODY: &str = "body";
+pub(crate) const CAMERA: &str = "camera";
 
 /// `google.protobuf.Timestamp`: time since the beginning of the recording.
 #[derive(Clone, Copy, PartialEq, Message)]
-pub(super) struct Timestamp {
+pub(crate) struct Timestamp {
     #[prost(int64, tag = "1")]
     seconds: i64,
     #[prost(int32, tag = "2")]
@@ -21,7 +21,7 @@ pub(super) struct Timestamp {
 const NANOS: i64 = 1_000_000_000;
 
 impl Timestamp {
-    pub(super) fn from_secs(secs: f64) -> Self {
+    pub(crate) fn from_secs(secs: f64) -> Self {
         let nanos = (secs * NANOS as f64).round() as i64;
         Self {
             seconds: nanos / NANOS,
@@ -29,24 +29,30 @@ impl Timestamp {
         }
     }
 
-    pub(super) fn nanos(self) -> u64 {
+    pub(crate) fn nanos(self) -> u64 {
         (self.seconds * NANOS + i64::from(self.nanos)).unsigned_abs()
     }
 
-    pub(super) fn secs(self) -> f64 {
+    pub(crate) fn secs(self) -> f64 {
         self.nanos() as f64 / NANOS as f64
     }
 }
 
 /// `foxglove.Vector3` and `foxglove.Point3`.
 #[derive(Clone, Copy, PartialEq, Message)]
-pub(super) struct Vector3 {
+pub(crate) struct Vector3 {
     #[prost(double, tag = "1")]
-    pub(super) x: f64,
+    pub(crate) x: f64,
     #[prost(double, tag = "2")]
-    pub(super) y: f64,
+    pub(crate) y: f64,
     #[prost(double, tag = "3")]
-    pub(super) z: f64,
+    pub(crate) z: f64,
+}
+
+impl From<Vector3> for [f32; 3] {
+    fn from(vector: Vector3) -> Self {
+        [vector.x, vector.y, vector.z].map(|value| value as f32)
+    }
 }
 
 impl From<[f32; 3]> for Vector3 {
@@ -58,15 +64,15 @@ impl From<[f32; 3]> for Vector3 {
 
 /// `foxglove.Quaternion`.
 #[derive(Clone, Copy, PartialEq, Message)]
-pub(super) struct Quaternion {
+pub(crate) struct Quaternion {
     #[prost(double, tag = "1")]
-    pub(super) x: f64,
+    pub(crate) x: f64,
     #[prost(double, tag = "2")]
-    pub(super) y: f64,
+    pub(crate) y: f64,
     #[prost(double, tag = "3")]
-    pub(super) z: f64,
+    pub(crate) z: f64,
     #[prost(double, tag = "4")]
-    pub(super) w: f64,
+    pub(crate) w: f64,
 }
 
 impl From<[f32; 4]> for Quaternion {
@@ -78,16 +84,16 @@ impl From<[f32; 4]> for Quaternion {
 
 /// `foxglove.Pose`.
 #[derive(Clone, Copy, PartialEq, Message)]
-pub(super) struct Pose {
+pub(crate) struct Pose {
     #[prost(message, optional, tag = "1")]
-    pub(super) position: Option<Vector3>,
+    pub(crate) position: Option<Vector3>,
     #[prost(message, optional, tag = "2")]
-    pub(super) orientation: Option<Quaternion>,
+    pub(crate) orientation: Option<Quaternion>,
 }
 
 impl Pose {
     /// The pose of the frame itself.
-    pub(super) fn origin() -> Self {
+    pub(crate) fn origin() -> Self {
         Self {
             position: Some([0.0; 3].into()),
             orientation: Some([0.0, 0.0, 0.0, 1.0].into()),
@@ -97,7 +103,7 @@ impl Pose {
 
 /// `foxglove.Color`.
 #[derive(Clone, Copy, PartialEq, Message)]
-pub(super) struct Color {
+pub(crate) struct Color {
     #[prost(double, tag = "1")]
     r: f64,
     #[prost(double, tag = "2")]
@@ -109,36 +115,36 @@ pub(super) struct Color {
 }
 
 impl Color {
-    pub(super) fn rgba([r, g, b, a]: [f64; 4]) -> Self {
+    pub(crate) fn rgba([r, g, b, a]: [f64; 4]) -> Self {
         Self { r, g, b, a }
     }
 }
 
 /// `foxglove.FrameTransform`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct FrameTransform {
+pub(crate) struct FrameTransform {
     #[prost(message, optional, tag = "1")]
-    pub(super) timestamp: Option<Timestamp>,
+    pub(crate) timestamp: Option<Timestamp>,
     #[prost(string, tag = "2")]
-    pub(super) parent_frame_id: String,
+    pub(crate) parent_frame_id: String,
     #[prost(string, tag = "3")]
-    pub(super) child_frame_id: String,
+    pub(crate) child_frame_id: String,
     #[prost(message, optional, tag = "4")]
-    pub(super) translation: Option<Vector3>,
+    pub(crate) translation: Option<Vector3>,
     #[prost(message, optional, tag = "5")]
-    pub(super) rotation: Option<Quaternion>,
+    pub(crate) rotation: Option<Quaternion>,
 }
 
 /// `foxglove.FrameTransforms`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct FrameTransforms {
+pub(crate) struct FrameTransforms {
     #[prost(message, repeated, tag = "1")]
-    pub(super) transforms: Vec<FrameTransform>,
+    pub(crate) transforms: Vec<FrameTransform>,
 }
 
 /// `foxglove.RawImage`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct RawImage {
+pub(crate) struct RawImage {
     #[prost(message, optional, tag = "1")]
     timestamp: Option<Timestamp>,
     #[prost(fixed32, tag = "2")]
@@ -150,19 +156,19 @@ pub(super) struct RawImage {
     #[prost(fixed32, tag = "5")]
     step: u32,
     #[prost(bytes = "vec", tag = "6")]
-    data: Vec<u8>,
+    pub(crate) data: Vec<u8>,
     #[prost(string, tag = "7")]
     frame_id: String,
 }
 
 impl RawImage {
     /// The depth image's own bytes; 255 is the camera's range or farther.
-    pub(super) fn of_depth(depth: &[u8], at: Timestamp) -> Self {
+    pub(crate) fn of_depth(depth: &[u8], at: Timestamp) -> Self {
         Self::new("mono8", 1, depth.to_vec(), at)
     }
 
     /// The depth image in whole millimetres.
-    pub(super) fn in_millimetres(depth: &[u8], range_m: f32, at: Timestamp) -> Self {
+    pub(crate) fn in_millimetres(depth: &[u8], range_m: f32, at: Timestamp) -> Self {
         let millimetres = |&depth: &u8| {
             let metres = f32::from(depth) / 255.0 * range_m;
             // A range of more than 65 m does not fit.
@@ -186,7 +192,7 @@ impl RawImage {
 
 /// `foxglove.CameraCalibration`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct CameraCalibration {
+pub(crate) struct CameraCalibration {
     #[prost(message, optional, tag = "1")]
     timestamp: Option<Timestamp>,
     #[prost(fixed32, tag = "2")]
@@ -209,7 +215,7 @@ pub(super) struct CameraCalibration {
 
 impl CameraCalibration {
     /// A camera without distortion. Pixels have their whole numbers in their middle, as in OpenCV.
-    pub(super) fn of(focal_px: f32, at: Timestamp) -> Self {
+    pub(crate) fn of(focal_px: f32, at: Timestamp) -> Self {
         let focal = f64::from(focal_px);
         let [x, y] = [IMAGE_WIDTH, IMAGE_HEIGHT].map(|pixels| pixels as f64 / 2.0 - 0.5);
         Self {
@@ -229,7 +235,7 @@ impl CameraCalibration {
 /// `foxglove.LogLevel`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Enumeration)]
 #[repr(i32)]
-pub(super) enum Level {
+pub(crate) enum Level {
     Unknown = 0,
     Debug = 1,
     Info = 2,
@@ -239,19 +245,19 @@ pub(super) enum Level {
 
 /// `foxglove.Log`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct Log {
+pub(crate) struct Log {
     #[prost(message, optional, tag = "1")]
     timestamp: Option<Timestamp>,
     #[prost(enumeration = "Level", tag = "2")]
     level: i32,
     #[prost(string, tag = "3")]
-    message: String,
+    pub(crate) message: String,
     #[prost(string, tag = "4")]
     name: String,
 }
 
 impl Log {
-    pub(super) fn new(level: Level, message: String, at: Timestamp) -> Self {
+    pub(crate) fn new(level: Level, message: String, at: Timestamp) -> Self {
         Self {
             timestamp: Some(at),
             level: level as i32,
@@ -263,79 +269,79 @@ impl Log {
 
 /// `foxglove.SceneEntityDeletion`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct SceneEntityDeletion {
+pub(crate) struct SceneEntityDeletion {
     #[prost(message, optional, tag = "1")]
-    pub(super) timestamp: Option<Timestamp>,
+    pub(crate) timestamp: Option<Timestamp>,
     /// 1 deletes all entities.
     #[prost(int32, tag = "2")]
-    pub(super) kind: i32,
+    pub(crate) kind: i32,
 }
 
 /// `foxglove.CubePrimitive`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct CubePrimitive {
+pub(crate) struct CubePrimitive {
     #[prost(message, optional, tag = "1")]
-    pub(super) pose: Option<Pose>,
+    pub(crate) pose: Option<Pose>,
     #[prost(message, optional, tag = "2")]
-    pub(super) size: Option<Vector3>,
+    pub(crate) size: Option<Vector3>,
     #[prost(message, optional, tag = "3")]
-    pub(super) color: Option<Color>,
+    pub(crate) color: Option<Color>,
 }
 
 /// `foxglove.LinePrimitive`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct LinePrimitive {
+pub(crate) struct LinePrimitive {
     /// 0 is a strip, 1 a loop.
     #[prost(int32, tag = "1")]
-    pub(super) kind: i32,
+    pub(crate) kind: i32,
     #[prost(message, optional, tag = "2")]
-    pub(super) pose: Option<Pose>,
+    pub(crate) pose: Option<Pose>,
     #[prost(double, tag = "3")]
-    pub(super) thickness: f64,
+    pub(crate) thickness: f64,
     #[prost(bool, tag = "4")]
-    pub(super) scale_invariant: bool,
+    pub(crate) scale_invariant: bool,
     #[prost(message, repeated, tag = "5")]
-    pub(super) points: Vec<Vector3>,
+    pub(crate) points: Vec<Vector3>,
     #[prost(message, optional, tag = "6")]
-    pub(super) color: Option<Color>,
+    pub(crate) color: Option<Color>,
 }
 
 /// `foxglove.TriangleListPrimitive`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct TriangleListPrimitive {
+pub(crate) struct TriangleListPrimitive {
     #[prost(message, optional, tag = "1")]
-    pub(super) pose: Option<Pose>,
+    pub(crate) pose: Option<Pose>,
     #[prost(message, repeated, tag = "2")]
-    pub(super) points: Vec<Vector3>,
+    pub(crate) points: Vec<Vector3>,
     #[prost(message, optional, tag = "3")]
-    pub(super) color: Option<Color>,
+    pub(crate) color: Option<Color>,
 }
 
 /// `foxglove.SceneEntity`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct SceneEntity {
+pub(crate) struct SceneEntity {
     #[prost(message, optional, tag = "1")]
-    pub(super) timestamp: Option<Timestamp>,
+    pub(crate) timestamp: Option<Timestamp>,
     #[prost(string, tag = "2")]
-    pub(super) frame_id: String,
+    pub(crate) frame_id: String,
     #[prost(string, tag = "3")]
-    pub(super) id: String,
+    pub(crate) id: String,
     /// The entity moves with its frame.
     #[prost(bool, tag = "5")]
-    pub(super) frame_locked: bool,
+    pub(crate) frame_locked: bool,
     #[prost(message, repeated, tag = "8")]
-    pub(super) cubes: Vec<CubePrimitive>,
+    pub(crate) cubes: Vec<CubePrimitive>,
     #[prost(message, repeated, tag = "11")]
-    pub(super) lines: Vec<LinePrimitive>,
+    pub(crate) lines: Vec<LinePrimitive>,
     #[prost(message, repeated, tag = "12")]
-    pub(super) triangles: Vec<TriangleListPrimitive>,
+    pub(crate) triangles: Vec<TriangleListPrimitive>,
 }
 
 /// `foxglove.SceneUpdate`.
 #[derive(Clone, PartialEq, Message)]
-pub(super) struct SceneUpdate {
+pub(crate) struct SceneUpdate {
     #[prost(message, repeated, tag = "1")]
-    pub(super) deletions: Vec<SceneEntityDeletion>,
+    pub(crate) deletions: Vec<SceneEntityDeletion>,
     #[prost(message, repeated, tag = "2")]
-    pub(super) entities: Vec<SceneEntity>,
+    pub(crate) entities: Vec<SceneEntity>,
 }

@@ -4,10 +4,14 @@ use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
 use skein_simulator::course::{Course, DRONE_WIDTH_M};
 
-use super::messages::{
+use crate::messages::{
     BODY, CAMERA, Color, CubePrimitive, FrameTransform, LinePrimitive, Pose, SceneEntity,
     SceneEntityDeletion, SceneUpdate, Timestamp, TriangleListPrimitive, Vector3, WORLD,
 };
+
+/// Beginnings of the entities' names.
+pub(crate) const CORRIDOR: &str = "corridor";
+pub(crate) const WALL: &str = "wall";
 
 /// Height of the drone's body, metres. Source: as for [`DRONE_WIDTH_M`].
 const DRONE_HEIGHT_M: f32 = 0.29;
@@ -15,13 +19,13 @@ const ALL: i32 = 1;
 const STRIP: i32 = 0;
 const LOOP: i32 = 1;
 
-const WALL: [f64; 4] = [0.45, 0.5, 0.58, 0.75];
+const WALL_COLOUR: [f64; 4] = [0.45, 0.5, 0.58, 0.75];
 const EDGE: [f64; 4] = [0.2, 0.22, 0.26, 1.0];
 const DRONE: [f64; 4] = [0.78, 0.33, 0.11, 1.0];
 const TRAIL: [f64; 4] = [0.12, 0.37, 0.66, 1.0];
 
 /// Returns the scene of an episode: it replaces everything of the one before.
-pub(super) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpdate {
+pub(crate) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpdate {
     let mut entities = vec![corridor(course, at), drone(at)];
     let walls = course.walls().iter().zip(course.wall_triangles());
     for (number, (wall, triangles)) in (1..).zip(walls) {
@@ -29,7 +33,7 @@ pub(super) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpd
             triangles: vec![TriangleListPrimitive {
                 pose: Some(Pose::origin()),
                 points: triangles.into_iter().flatten().map(Vector3::from).collect(),
-                color: Some(Color::rgba(WALL)),
+                color: Some(Color::rgba(WALL_COLOUR)),
             }],
             lines: vec![line(
                 LOOP,
@@ -38,11 +42,11 @@ pub(super) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpd
                     .map(|&[y_m, z_m]| [wall.x_m(), y_m, z_m]),
                 EDGE,
             )],
-            ..entity(WORLD, format!("wall {number}"), at)
+            ..entity(WORLD, format!("{WALL} {number}"), at)
         });
     }
     if let Some(first) = entities.first_mut() {
-        first.id = format!("corridor: {title}");
+        first.id = format!("{CORRIDOR}: {title}");
     }
     SceneUpdate {
         deletions: vec![SceneEntityDeletion {
@@ -54,7 +58,7 @@ pub(super) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpd
 }
 
 /// Returns the way of the drone within one step.
-pub(super) fn trail(step: u32, from_m: [f32; 3], to_m: [f32; 3], at: Timestamp) -> SceneUpdate {
+pub(crate) fn trail(step: u32, from_m: [f32; 3], to_m: [f32; 3], at: Timestamp) -> SceneUpdate {
     let way = SceneEntity {
         lines: vec![line(STRIP, [from_m, to_m], TRAIL)],
         ..entity(WORLD, format!("trail {step}"), at)
@@ -68,7 +72,7 @@ pub(super) fn trail(step: u32, from_m: [f32; 3], to_m: [f32; 3], at: Timestamp) 
 /// Returns the frames at an observation: the body in the world, and the camera in the body.
 ///
 /// The axes of the body are forward, left, up, those of the camera right, down, forward.
-pub(super) fn frames(
+pub(crate) fn frames(
     record: &TransitionRecord,
     camera: &CameraSettings,
     at: Timestamp,
@@ -113,7 +117,7 @@ fn corridor(course: &Course, at: Timestamp) -> SceneEntity {
     let rings = [ring(0.0), ring(corridor.length_m)];
     SceneEntity {
         lines: rings.into_iter().chain(along).collect(),
-        ..entity(WORLD, "corridor".to_owned(), at)
+        ..entity(WORLD, CORRIDOR.to_owned(), at)
     }
 }
 

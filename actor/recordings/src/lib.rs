@@ -1,10 +1,12 @@
-//! Recordings of evaluation episodes as MCAP, with Foxglove's schemas, for Foxglove and Rerun.
+//! Recordings of episodes as MCAP, with Foxglove's schemas, for Foxglove, Rerun and the page of
+//! `skein watch`.
 //!
 //! Episodes follow each other on one time axis. Each step has the numbers of the `.npz` recording,
 //! the depth image with its calibration, and the frames world, body and camera. Each episode begins
 //! with its walls and the drone as a scene. File format: <https://mcap.dev/spec>.
 
 mod messages;
+mod read;
 mod scene;
 mod schemas;
 
@@ -17,9 +19,8 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 use prost::Message;
 use skein_protocol::REWARD_TERM_NAMES;
+use skein_protocol::evaluation::EpisodeScore;
 use skein_protocol::transition::{Outcome, TransitionRecord};
-use skein_rollout::courses::Courses;
-use skein_rollout::evaluation::EvaluatedEpisode;
 use skein_rollout::recording::RecordingRow;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::SimulatorSettings;
@@ -27,39 +28,24 @@ use skein_simulator::simulator::SimulatorSettings;
 use messages::{CameraCalibration, FrameTransforms, Level, Log, RawImage, Timestamp};
 use schemas::{Schema, encode_reward, encode_step};
 
+pub use read::{MOST_STEPS, RecordedFlight, RecordedStep, RecordedWall, images, read};
+
 /// Pause between two episodes on the time axis, seconds.
 const PAUSE_SECS: f64 = 1.0;
 
-/// Writes `episodes`, entry by entry, to `path`. `latent` is the length of their codes.
-///
-/// # Errors
-/// Of the file, or if a course cannot be generated again.
-pub(crate) fn write(
-    path: &Path,
-    courses: &Courses,
-    latent: usize,
-    episodes: &[Vec<EvaluatedEpisode>],
-) -> io::Result<()> {
-    let mut recording = Recording::create(path, courses.settings())?;
-    recording.write_names(courses)?;
-    for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
-        for (number, episode) in (0..).zip(episodes) {
-            let course = entry.courses.of_episode(number);
-            let course = course.map_err(io::Error::other)?;
-            let title = format!("{}, episode {number}", entry.name);
-            recording.begin_episode(&title, &course)?;
-            for record in &episode.records {
-                recording.write_step(&RecordingRow {
-                    course: entry_number,
-                    episode: number as i32,
-                    latent,
-                    record,
-                })?;
-            }
-            recording.end_episode(episode)?;
-        }
-    }
-    recording.finish()
+/// Episode to record.
+#[derive(Debug, Clone, Copy)]
+pub struct Episode<'a> {
+    /// Title, unique in the recording.
+    pub title: &'a str,
+    /// The course, and its number among the recording's courses.
+    pub course: (&'a Course, i32),
+    /// Number of the episode on that course.
+    pub number: i32,
+    /// Length of the latent codes.
+    pub latent: usize,
+    /// How it ended.
+    pub score: EpisodeScore,
 }
 
 /// Topics of a recording.
@@ -118,7 +104,7 @@ impl Topic {
 }
 
 /// An MCAP file under way.
-struct Recording<'a> {
+pub struct Recording<'a> {
     settings: &'a SimulatorSettings,
     writer: Writer<BufWriter<File>>,
     /// Number of each topic of [`Topic::ALL`] in the file.
@@ -135,7 +121,15 @@ struct Recording<'a> {
 }
 
 impl<'a> Recording<'a> {
-    fn create(path: &Path, settings: &'a SimulatorSettings) -> io::Result<Self> {
+    /// Creates the file `path` of flights with `settings` through `courses`.
+    ///
+    /// # Errors
+    /// Of the file.
+    pub fn create(
+        path: &Path,
+        settings: &'a SimulatorSettings,
+        courses: &[&str],
+    ) -> io::Result<Self> {
         let options = WriteOptions::new()
             .library(concat!("skein ", env!("CARGO_PKG_VERSION")))
             .compression(Some(Compression::Lz4));
@@ -149,7 +143,7 @@ impl<'a> Recording<'a> {
             let channel = writer.add_channel(schema, topic.name(), "protobuf", &BTreeMap::new());
             channels.push(channel.map_err(io::Error::other)?);
         }
-        Ok(Self {
+        let mut recording = Self {
             settings,
             writer,
             channels,
@@ -158,27 +152,45 @@ impl<'a> Recording<'a> {
             now: Timestamp::default(),
             walls_passed: 0,
             before_m: None,
-        })
+        };
+        recording.write_names("course_names", courses)?;
+        recording.write_names("reward_term_names", &REWARD_TERM_NAMES)?;
+        Ok(recording)
     }
 
-    /// Writes what the numbers in the steps stand for.
-    fn write_names(&mut self, courses: &Courses) -> io::Result<()> {
-        let of_courses = courses.evaluation().enumerate();
-        let of_courses = of_courses.map(|(number, entry)| (number.to_string(), entry.name.clone()));
-        let of_terms = REWARD_TERM_NAMES.iter().enumerate();
-        let of_terms = of_terms.map(|(number, name)| (number.to_string(), (*name).to_owned()));
-        for (name, metadata) in [
-            ("course_names", of_courses.collect()),
-            ("reward_term_names", of_terms.collect()),
-        ] {
-            let metadata = Metadata {
-                name: name.to_owned(),
-                metadata,
-            };
-            let written = self.writer.write_metadata(&metadata);
-            written.map_err(io::Error::other)?;
+    /// Adds an episode: its steps, then its closing record.
+    ///
+    /// # Errors
+    /// Of the file.
+    pub fn add<'r>(
+        &mut self,
+        episode: &Episode<'_>,
+        records: impl IntoIterator<Item = &'r TransitionRecord>,
+    ) -> io::Result<()> {
+        let (course, number) = episode.course;
+        self.begin_episode(episode.title, course)?;
+        for record in records {
+            self.write_step(&RecordingRow {
+                course: number,
+                episode: episode.number,
+                latent: episode.latent,
+                record,
+            })?;
         }
-        Ok(())
+        self.end_episode(&episode.score)
+    }
+
+    /// Writes what the numbers of a column in the steps stand for.
+    fn write_names(&mut self, list: &str, names: &[&str]) -> io::Result<()> {
+        let numbered = names.iter().enumerate();
+        let metadata = Metadata {
+            name: list.to_owned(),
+            metadata: numbered
+                .map(|(number, name)| (number.to_string(), (*name).to_owned()))
+                .collect(),
+        };
+        let written = self.writer.write_metadata(&metadata);
+        written.map_err(io::Error::other)
     }
 
     fn begin_episode(&mut self, title: &str, course: &Course) -> io::Result<()> {
@@ -222,8 +234,8 @@ impl<'a> Recording<'a> {
         self.log(Level::Info, format!("passed wall {}", record.walls_passed))
     }
 
-    fn end_episode(&mut self, episode: &EvaluatedEpisode) -> io::Result<()> {
-        let (level, event) = match (episode.score.outcome, episode.score.hit_wall) {
+    fn end_episode(&mut self, score: &EpisodeScore) -> io::Result<()> {
+        let (level, event) = match (score.outcome, score.hit_wall) {
             (Outcome::ReachedEnd, _) => (Level::Info, "reached the end".to_owned()),
             (Outcome::Collided, Some(wall)) => (Level::Error, format!("hit wall {wall}")),
             (Outcome::Collided, None) => (Level::Error, "hit the corridor".to_owned()),
@@ -256,7 +268,11 @@ impl<'a> Recording<'a> {
         written.map_err(io::Error::other)
     }
 
-    fn finish(mut self) -> io::Result<()> {
+    /// Completes the file and hands it to the disk.
+    ///
+    /// # Errors
+    /// Of the file.
+    pub fn finish(mut self) -> io::Result<()> {
         self.writer.finish().map_err(io::Error::other)?;
         self.writer.into_inner().into_inner()?.sync_all()
     }

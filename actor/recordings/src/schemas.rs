@@ -2,19 +2,20 @@
 //! `.npz` recording, so that both recordings hold the same values.
 
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 
 use prost::Message;
-use prost::encoding::{WireType, encode_key, encode_varint};
+use prost::encoding::{WireType, decode_key, decode_varint, encode_key, encode_varint};
 use skein_protocol::REWARD_TERM_NAMES;
 use skein_protocol::transition::TransitionRecord;
 use skein_rollout::recording::{COLUMNS, Column, RecordingRow};
 
 /// A message's schema.
-pub(super) struct Schema {
+pub(crate) struct Schema {
     /// Name of the message.
-    pub(super) name: &'static str,
+    pub(crate) name: &'static str,
     /// `google.protobuf.FileDescriptorSet`.
-    pub(super) descriptors: Cow<'static, [u8]>,
+    pub(crate) descriptors: Cow<'static, [u8]>,
 }
 
 macro_rules! foxglove {
@@ -22,7 +23,7 @@ macro_rules! foxglove {
         Schema {
             name: concat!("foxglove.", $name),
             descriptors: Cow::Borrowed(include_bytes!(concat!(
-                "../../schemas/foxglove.",
+                "../schemas/foxglove.",
                 $name,
                 ".bin"
             ))),
@@ -30,14 +31,14 @@ macro_rules! foxglove {
     };
 }
 
-pub(super) const SCENE_UPDATE: Schema = foxglove!("SceneUpdate");
-pub(super) const FRAME_TRANSFORMS: Schema = foxglove!("FrameTransforms");
-pub(super) const RAW_IMAGE: Schema = foxglove!("RawImage");
-pub(super) const CAMERA_CALIBRATION: Schema = foxglove!("CameraCalibration");
-pub(super) const LOG: Schema = foxglove!("Log");
+pub(crate) const SCENE_UPDATE: Schema = foxglove!("SceneUpdate");
+pub(crate) const FRAME_TRANSFORMS: Schema = foxglove!("FrameTransforms");
+pub(crate) const RAW_IMAGE: Schema = foxglove!("RawImage");
+pub(crate) const CAMERA_CALIBRATION: Schema = foxglove!("CameraCalibration");
+pub(crate) const LOG: Schema = foxglove!("Log");
 
 /// Returns the schema of [`encode_step`].
-pub(super) fn step() -> Schema {
+pub(crate) fn step() -> Schema {
     let fields = (1..).zip(&COLUMNS).filter_map(|(number, column)| {
         let (kind, label) = match Encoding::of(column)? {
             Encoding::Floats => (TYPE_FLOAT, REPEATED),
@@ -51,7 +52,7 @@ pub(super) fn step() -> Schema {
 }
 
 /// Returns the schema of [`encode_reward`].
-pub(super) fn reward() -> Schema {
+pub(crate) fn reward() -> Schema {
     let names = REWARD_TERM_NAMES.iter().chain(&["total"]);
     let fields = (1..).zip(names);
     let fields = fields.map(|(number, name)| field(name, number, OPTIONAL, TYPE_FLOAT));
@@ -59,7 +60,7 @@ pub(super) fn reward() -> Schema {
 }
 
 /// Returns an observation in Protobuf's encoding: a field for each column but the image.
-pub(super) fn encode_step(row: &RecordingRow<'_>) -> Vec<u8> {
+pub(crate) fn encode_step(row: &RecordingRow<'_>) -> Vec<u8> {
     let mut message = Vec::new();
     let mut bytes = Vec::new();
     for (number, column) in (1..).zip(&COLUMNS) {
@@ -87,8 +88,37 @@ pub(super) fn encode_step(row: &RecordingRow<'_>) -> Vec<u8> {
     message
 }
 
+/// Returns the numbers of a step by the names of their columns; `None` if it is damaged. Columns of
+/// a later Skein are left out.
+pub(crate) fn decode_step(mut message: &[u8]) -> Option<BTreeMap<&'static str, Vec<f32>>> {
+    let mut numbers = BTreeMap::new();
+    while !message.is_empty() {
+        let (field, wire_type) = decode_key(&mut message).ok()?;
+        let values = match wire_type {
+            WireType::LengthDelimited => {
+                let length = decode_varint(&mut message).ok()?;
+                let (bytes, rest) = message.split_at_checked(usize::try_from(length).ok()?)?;
+                message = rest;
+                let floats = bytes.as_chunks::<4>().0.iter();
+                floats.map(|&bytes| f32::from_le_bytes(bytes)).collect()
+            }
+            WireType::ThirtyTwoBit => {
+                let (&bytes, rest) = message.split_first_chunk::<4>()?;
+                message = rest;
+                vec![f32::from_le_bytes(bytes)]
+            }
+            WireType::Varint => vec![decode_varint(&mut message).ok()? as f32],
+            _ => return None,
+        };
+        if let Some(column) = COLUMNS.get(field as usize - 1) {
+            numbers.insert(column.name, values);
+        }
+    }
+    Some(numbers)
+}
+
 /// Returns the reward's terms and their sum in Protobuf's encoding.
-pub(super) fn encode_reward(record: &TransitionRecord) -> Vec<u8> {
+pub(crate) fn encode_reward(record: &TransitionRecord) -> Vec<u8> {
     let mut message = Vec::new();
     let values = record.reward_terms.iter().chain([&record.reward]);
     for (number, value) in (1..).zip(values) {
