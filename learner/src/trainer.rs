@@ -258,9 +258,11 @@ impl Trainer {
         &self.replay
     }
 
-    /// Exploration of the next episodes to be ordered.
+    /// Exploration of the next episodes to be ordered. A policy that training starts from flies the
+    /// warm-up too.
     pub(crate) fn exploration(&self) -> Exploration {
-        if self.steps < self.config.learning.warmup_steps as u64 {
+        let learning = &self.config.learning;
+        if self.steps < learning.warmup_steps as u64 && learning.start_from.is_none() {
             Exploration::Uniform
         } else {
             Exploration::Sample

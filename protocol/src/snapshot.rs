@@ -17,6 +17,7 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 use crate::ACTION;
 use crate::config::{AlgorithmName, Config, ObservationLayout};
+use crate::encoder_file;
 use crate::files::{self, TENSOR_BYTES};
 use crate::ids::{PolicyVersion, RunId};
 
@@ -480,6 +481,9 @@ impl<'a> ParameterFile<'a> {
 fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let file = ParameterFile::parse(bytes)?;
     let format = file.text(FORMAT_KEY)?;
+    if format == encoder_file::FORMAT {
+        return Err("it holds an encoder alone, for vae.start_from".to_owned());
+    }
     if format != FORMAT {
         return Err(format!("its format is {format}, not {FORMAT}"));
     }
