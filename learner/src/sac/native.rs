@@ -52,8 +52,6 @@ pub struct NativeSac {
     target_rate: f32,
     target_entropy: f32,
     teacher: TeacherSection,
-    /// First updates that leave policy and temperature as they are.
-    critic_warmup_updates: u64,
     buffers: UpdateBuffers,
 }
 
@@ -120,7 +118,6 @@ impl NativeSac {
             target_rate: section.target_rate as f32,
             target_entropy: section.target_entropy.value() as f32,
             teacher: TeacherSection::default(),
-            critic_warmup_updates: section.critic_warmup_updates,
             buffers: UpdateBuffers::default(),
         }
     }
@@ -355,11 +352,9 @@ impl Algorithm for NativeSac {
         let metrics = [critic_loss, policy_loss, temperature, -log_prob, mean_value];
         self.check(metrics)?;
         let isa = self.isa;
-        if self.updates() >= self.critic_warmup_updates {
-            self.policy_parameters.step(team, isa);
-            self.log_temperature.step(team, isa);
-        }
         self.critic_parameters.step(team, isa);
+        self.policy_parameters.step(team, isa);
+        self.log_temperature.step(team, isa);
         let (target, critic) = (&mut self.target_parameters, &self.critic_parameters.values);
         follow(team, isa, target, critic, self.target_rate);
         Ok(reported(metrics, distance))

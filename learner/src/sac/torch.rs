@@ -41,8 +41,6 @@ pub struct TorchSac {
     target_rate: f64,
     target_entropy: f64,
     teacher: TeacherSection,
-    /// First updates that leave policy and temperature as they are.
-    critic_warmup_updates: u64,
 }
 
 impl TorchSac {
@@ -90,7 +88,6 @@ impl TorchSac {
             target_rate: section.target_rate,
             target_entropy: section.target_entropy.value(),
             teacher: TeacherSection::default(),
-            critic_warmup_updates: section.critic_warmup_updates,
         }
     }
 
@@ -207,14 +204,12 @@ impl Algorithm for TorchSac {
                 ("temperature gradient", &temperature_gradient),
             ],
         )?;
-        if self.updates() >= self.critic_warmup_updates {
-            self.policy_optimizer
-                .step(self.policy_parameters.flat_mut(), &policy_gradient);
-            self.temperature_optimizer
-                .step(&mut self.log_temperature, &temperature_gradient);
-        }
         self.critic_optimizer
             .step(self.critic_parameters.flat_mut(), &critic_gradient);
+        self.policy_optimizer
+            .step(self.policy_parameters.flat_mut(), &policy_gradient);
+        self.temperature_optimizer
+            .step(&mut self.log_temperature, &temperature_gradient);
         self.target_parameters
             .follow(&self.critic_parameters, self.target_rate);
         let distance = distance.map(|distance| distance.double_value(&[]) as f32);

@@ -125,7 +125,6 @@ fn a_policy_to_start_from_is_the_first_candidate() {
         config.vae.train_steps = 0;
         config.vae.start_from = Some(path.clone());
         config.learning.start_from = Some(path);
-        config.sac.critic_warmup_updates = 1;
     });
     let mut training = run.begin();
     assert!(training.is_candidate());

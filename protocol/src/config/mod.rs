@@ -341,15 +341,6 @@ impl Config {
             &value,
             "needs the encoder that the policy was trained with: name the same file in \
             vae.start_from, and set vae.train_steps to 0",
-        )?;
-        require(
-            self.learning.algorithm != AlgorithmName::Sac
-                || self.teacher.is_configured()
-                || self.sac.critic_warmup_updates > 0,
-            "sac.critic_warmup_updates",
-            self.sac.critic_warmup_updates,
-            "lets an untrained critic destroy the policy of learning.start_from: set it to 3000, \
-            or name a teacher in teacher.policy",
         )
     }
 

@@ -38,10 +38,6 @@ pub struct SacSection {
     /// Entropy in nats that the temperature steers towards, or `auto`: minus the number of action
     /// dimensions. Default `auto`.
     pub target_entropy: TargetEntropy,
-    /// First updates, which move the critic alone and leave policy and temperature as they are. A
-    /// policy to start from (`learning.start_from`) needs them: an untrained critic would destroy
-    /// it. Default 0.
-    pub critic_warmup_updates: u64,
 }
 
 impl Default for SacSection {
@@ -57,7 +53,6 @@ impl Default for SacSection {
             target_rate: 0.005,
             initial_temperature: 0.2,
             target_entropy: TargetEntropy::Auto,
-            critic_warmup_updates: 0,
         }
     }
 }
