@@ -297,7 +297,9 @@ impl Trainer {
     /// [`InsertError`] when the episode's parts do not fit together.
     pub(crate) fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
-        let mirrored = learning.mirror.then(|| episode.mirrored());
+        let mirrored = learning
+            .mirror
+            .then(|| episode.mirrored(self.config.action_space()));
         // With policy lag, some episodes arrive after the freeze that were flown with an older
         // encoder: encode them again. Without lag, images come only for the mirror, and likewise
         // with an encoder that never changes.

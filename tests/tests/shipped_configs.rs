@@ -43,6 +43,7 @@ fn the_shipped_configurations_exist() {
             "local.toml",
             "one-course.toml",
             "paper.toml",
+            "slalom.toml",
             "smoke.toml"
         ]
     );
@@ -106,7 +107,8 @@ fn every_shipped_suite_can_be_flown_and_one_has_an_entry_per_family_of_shapes() 
         |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
     let [generalist, shapes, untried] =
         ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
-    let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
+    let (paper, slalom) = (suite("paper.toml"), suite("slalom.toml"));
+    let all = [&generalist, &shapes, &untried, &paper, &slalom];
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
         entry.courses.of_episode(0).unwrap();
     }

@@ -32,3 +32,5 @@ pub mod text;
 pub mod vehicle;
 pub mod viewpoints;
 mod world;
+
+pub use skein_action::{Action, ActionSpace};

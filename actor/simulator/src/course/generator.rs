@@ -239,20 +239,23 @@ impl Course {
             layout.corridor,
             layout.start,
             layout.wall_thickness_m,
+            layout.sidestep(),
         )?;
         let next = layout.wall_x_m.iter().copied().map(Some).skip(1);
         for (&x_m, next_x_m) in layout.wall_x_m.iter().zip(next.chain([None])) {
-            course.add_random_wall(x_m, next_x_m, ranges, &mut rng)?;
+            let across_m = layout.across_m(course.walls.len());
+            course.add_random_wall(x_m, next_x_m, across_m, ranges, &mut rng)?;
         }
         Ok(course)
     }
 
     /// Draws walls until one can be flown after those already in the course, and leaves room for
-    /// the wall at `next_x_m`.
+    /// the wall at `next_x_m`. `across_m`: range of its opening's centre along y.
     fn add_random_wall(
         &mut self,
         x_m: f32,
         next_x_m: Option<f32>,
+        across_m: [f32; 2],
         ranges: &GeneratorRanges,
         rng: &mut impl Rng,
     ) -> Result<(), RangesError> {
@@ -265,7 +268,7 @@ impl Course {
             let layout = WallLayout {
                 label,
                 x_m,
-                opening: ranges.draw_opening(self, x_m, rng),
+                opening: ranges.draw_opening(self, x_m, across_m, rng),
             };
             match self.add_wall_before(layout, next_x_m) {
                 Ok(()) => return Ok(()),
@@ -368,16 +371,22 @@ impl GeneratorRanges {
                 start: self.start,
                 wall_x_m: self.wall_x_m.clone(),
                 wall_thickness_m: self.wall_thickness_m,
+                slalom: None,
             },
         }
     }
 
     /// Draws an opening for the next wall of `course`, where the drone can reach it.
-    fn draw_opening(&self, course: &Course, x_m: f32, rng: &mut impl Rng) -> Opening {
+    fn draw_opening(
+        &self,
+        course: &Course,
+        x_m: f32,
+        across_m: [f32; 2],
+        rng: &mut impl Rng,
+    ) -> Opening {
         let kind = self.shapes[rng.random_range(0..self.shapes.len())];
         let clearance_m = rng.random_range(self.clearance_m[0]..=self.clearance_m[1]);
         let shape = kind.draw(clearance_m, rng);
-        let (half_y, height) = (course.corridor.width_m / 2.0, course.corridor.height_m);
         let [in_reach_y, in_reach_z] = check::in_reach(course, x_m);
         // A shape's safe point may lie beside its centre, but not farther than its free space.
         let mut within = |[least, most]: [f32; 2], [near, far]: [f32; 2]| {
@@ -387,8 +396,8 @@ impl GeneratorRanges {
         Opening {
             shape,
             centre_m: [
-                within([-half_y, half_y], in_reach_y),
-                within([0.0, height], in_reach_z),
+                within(across_m, in_reach_y),
+                within([0.0, course.corridor.height_m], in_reach_z),
             ],
             rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
         }

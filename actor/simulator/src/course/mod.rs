@@ -149,7 +149,18 @@ pub struct Course {
     corridor: Corridor,
     start: StartArea,
     wall_thickness_m: f32,
+    sidestep: Sidestep,
     walls: Vec<Wall>,
+}
+
+/// How a drone gets from one opening to the next, and so how far apart walls must be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Sidestep {
+    /// While it flies on at 1 m/s.
+    #[default]
+    Flying,
+    /// While it hovers between the walls.
+    Hovering,
 }
 
 impl Course {
@@ -163,6 +174,7 @@ impl Course {
             layout.corridor,
             layout.start,
             layout.wall_thickness_m,
+            Sidestep::Flying,
         )?;
         check::wall_count(layout.walls.len())?;
         for wall in layout.walls {
@@ -177,12 +189,14 @@ impl Course {
         corridor: Corridor,
         start: StartArea,
         wall_thickness_m: f32,
+        sidestep: Sidestep,
     ) -> Result<Self, CourseFault> {
         let course = Self {
             name,
             corridor,
             start,
             wall_thickness_m,
+            sidestep,
             walls: Vec::new(),
         };
         check::corridor_and_start(&course)?;

@@ -16,8 +16,8 @@ mod tests;
 
 use std::sync::Arc;
 
-use nalgebra::Vector3;
 use rand::Rng;
+use skein_action::{Action, MAX_ACTION};
 
 pub use error::{SimulationError, SimulatorError};
 pub use ground_truth::{GroundTruth, OpeningAhead};
@@ -29,8 +29,8 @@ pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
 use crate::disturbances::{CommandDelay, DisturbanceSettings, DrawnDisturbances, Gust};
-use crate::oracle;
-use crate::vehicle::{Vehicle, VehicleState};
+use crate::oracle::Oracle;
+use crate::vehicle::{Command, Vehicle, VehicleSettings, VehicleState};
 use crate::world::{Contact, World};
 
 /// A drone in a course.
@@ -39,7 +39,7 @@ pub struct Simulator {
     max_steps: u32,
     physics_steps: u32,
     dt_secs: f32,
-    forward_speed_mps: f32,
+    vehicle_settings: VehicleSettings,
     pristine_vehicle: Vehicle,
     vehicle: Vehicle,
     world: World,
@@ -99,7 +99,7 @@ impl Simulator {
             max_steps: settings.max_steps,
             physics_steps,
             dt_secs,
-            forward_speed_mps: settings.vehicle.forward_speed_mps,
+            vehicle_settings: settings.vehicle.clone(),
             pristine_vehicle: vehicle.clone(),
             vehicle,
             world,
@@ -160,8 +160,10 @@ impl Simulator {
         Ok(())
     }
 
-    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each
-    /// clamped to [-1, 1]. With latency, `action` takes effect some steps later.
+    /// Flies one control period with `action`: the numbers of
+    /// [`VehicleSettings::action`](crate::vehicle::VehicleSettings::action) in order, each clamped
+    /// to [-1, 1]. Missing ones are 0, further ones are ignored. With latency, `action` takes effect
+    /// some steps later.
     ///
     /// If the body touches something, the episode ends at that physics step, within the control
     /// period, and the state is that of the contact.
@@ -169,15 +171,18 @@ impl Simulator {
     /// # Errors
     /// [`SimulationError::NonFinite`] names what is NaN or infinite, in the action or the physics;
     /// it ends the episode. [`SimulationError::NotFlying`] if no episode is in progress.
-    pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
+    pub fn step<const N: usize>(
+        &mut self,
+        action: [f32; N],
+    ) -> Result<StepReport, SimulationError> {
         if self.episode.phase == EpisodePhase::Over {
             return Err(SimulationError::NotFlying);
         }
         self.episode.steps += 1;
         let walls_behind_before = self.episode.walls_behind;
 
-        let velocity_mps = self.commanded_velocity(action)?;
-        let contact = self.fly_until_contact(&velocity_mps)?;
+        let command = self.command(action)?;
+        let contact = self.fly_until_contact(&command)?;
         let outcome = self.outcome(contact);
 
         if outcome.is_some() {
@@ -214,13 +219,16 @@ impl Simulator {
         self.world.state()
     }
 
-    /// Returns the oracle's action `[v_y, v_z]` for the current moment, m/s in the heading frame,
-    /// each in [-1, 1].
+    /// Returns the oracle's action for the current moment, each number in [-1, 1].
     #[must_use]
-    pub fn oracle_action(&self) -> [f32; 2] {
-        let hold_m = self.world.tail_x_m() - oracle::HOLD_M;
-        let walls_behind = self.course.walls_before(hold_m);
-        oracle::action(&self.course, walls_behind, &self.state())
+    pub fn oracle_action(&self) -> Action {
+        let oracle = Oracle {
+            course: &self.course,
+            vehicle: &self.vehicle_settings,
+            half_length_m: self.vehicle.body().half_extents_m.x,
+        };
+        let command = oracle.command(self.world.tail_x_m(), &self.state());
+        self.vehicle_settings.action_for(&command)
     }
 
     /// Returns the ground truth of the current moment, which the camera does not show.
@@ -265,22 +273,23 @@ impl Simulator {
         &self.course
     }
 
-    fn commanded_velocity(&mut self, action: [f32; 2]) -> Result<Vector3<f32>, SimulationError> {
+    fn command<const N: usize>(&mut self, action: [f32; N]) -> Result<Command, SimulationError> {
+        const { assert!(N <= MAX_ACTION, "an action has at most MAX_ACTION numbers") };
         if !action.iter().all(|v| v.is_finite()) {
             return Err(self.abort("action"));
         }
-        let [left, up] = self.commands.pass(action.map(|v| v.clamp(-1.0, 1.0)));
-        Ok(Vector3::new(self.forward_speed_mps, left, up))
+        let mut numbers = [0.0; MAX_ACTION];
+        numbers[..N].copy_from_slice(&action.map(|v| v.clamp(-1.0, 1.0)));
+        let taken = self.commands.pass(numbers);
+        Ok(self.vehicle_settings.command(&taken))
     }
 
-    fn fly_until_contact(
-        &mut self,
-        velocity_mps: &Vector3<f32>,
-    ) -> Result<Contact, SimulationError> {
+    fn fly_until_contact(&mut self, command: &Command) -> Result<Contact, SimulationError> {
+        let counted = self.episode.walls_behind;
         for _ in 0..self.physics_steps {
             let actuation = self
                 .vehicle
-                .actuate(&self.world.state(), velocity_mps, self.dt_secs);
+                .actuate(&self.world.state(), command, self.dt_secs);
             let gust_n = self.gust.as_mut().map(Gust::advance);
             self.world.advance(&actuation, gust_n);
 
@@ -288,7 +297,7 @@ impl Simulator {
                 return Err(self.abort("the body's pose or velocity"));
             }
             let contact = self.world.contact();
-            self.count_walls(contact);
+            self.count_walls(contact, counted);
             if contact != Contact::Nothing {
                 return Ok(contact);
             }
@@ -296,17 +305,19 @@ impl Simulator {
         Ok(Contact::Nothing)
     }
 
-    /// Counts the walls passed after a physics step that ended with `contact`.
-    fn count_walls(&mut self, contact: Contact) {
+    /// Counts the walls passed after a physics step that ended with `contact`. `counted`: walls that
+    /// earlier control periods counted.
+    fn count_walls(&mut self, contact: Contact, counted: usize) {
         let passed = self.episode.walls_behind;
         self.episode.walls_behind = match contact {
-            // A passed wall stays passed if a gust blows the drone back without a collision.
+            // A passed wall stays passed if the drone comes back without a collision.
             Contact::Nothing | Contact::EndWall => passed.max(self.walls_left()),
-            // No episode passes a wall and hits it, not even one that is blown back into it.
+            // No step passes a wall and hits it. What an earlier step reported stands, even if the
+            // drone flies or is blown back into that wall.
             Contact::Obstacle => self
                 .world
                 .touched_wall()
-                .map_or(passed, |hit| hit.min(passed)),
+                .map_or(passed, |hit| hit.min(passed).max(counted)),
         };
     }
 

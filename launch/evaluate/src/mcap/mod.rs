@@ -16,8 +16,8 @@ use std::path::Path;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 use prost::Message;
-use skein_protocol::REWARD_TERM_NAMES;
-use skein_protocol::transition::{Outcome, TransitionRecord};
+use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
+use skein_protocol::{ActionSpace, REWARD_TERM_NAMES};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::EvaluatedEpisode;
 use skein_rollout::recording::RecordingRow;
@@ -30,18 +30,18 @@ use schemas::{Schema, encode_reward, encode_step};
 /// Pause between two episodes on the time axis, seconds.
 const PAUSE_SECS: f64 = 1.0;
 
-/// Writes `episodes`, entry by entry, to `path`. `latent` is the length of their codes.
+/// Writes `episodes`, entry by entry, to `path`.
 ///
 /// # Errors
 /// Of the file, or if a course cannot be generated again.
 pub(crate) fn write(
     path: &Path,
     courses: &Courses,
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> io::Result<()> {
     let mut recording = Recording::create(path, courses.settings())?;
-    recording.write_names(courses)?;
+    recording.write_names(courses, lengths.action)?;
     for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
         for (number, episode) in (0..).zip(episodes) {
             let course = entry.courses.of_episode(number);
@@ -52,7 +52,7 @@ pub(crate) fn write(
                 recording.write_step(&RecordingRow {
                     course: entry_number,
                     episode: number as i32,
-                    latent,
+                    lengths,
                     record,
                 })?;
             }
@@ -162,12 +162,15 @@ impl<'a> Recording<'a> {
     }
 
     /// Writes what the numbers in the steps stand for.
-    fn write_names(&mut self, courses: &Courses) -> io::Result<()> {
+    fn write_names(&mut self, courses: &Courses, action: ActionSpace) -> io::Result<()> {
         let of_courses = courses.evaluation().enumerate();
         let of_courses = of_courses.map(|(number, entry)| (number.to_string(), entry.name.clone()));
         let of_terms = REWARD_TERM_NAMES.iter().enumerate();
         let of_terms = of_terms.map(|(number, name)| (number.to_string(), (*name).to_owned()));
+        let of_axes = action.axes().iter().enumerate();
+        let of_axes = of_axes.map(|(number, axis)| (number.to_string(), axis.name().to_owned()));
         for (name, metadata) in [
+            ("action_names", of_axes.collect()),
             ("course_names", of_courses.collect()),
             ("reward_term_names", of_terms.collect()),
         ] {
