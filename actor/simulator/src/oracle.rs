@@ -42,6 +42,12 @@ impl Steering {
     fn velocity(&self, distance_m: f32, velocity_mps: f32) -> f32 {
         self.approach_per_sec * distance_m - self.damping * velocity_mps
     }
+
+    /// Returns the velocity to command so that the drone soon has the velocity `wanted_mps`, m/s in
+    /// [-1, 1].
+    fn pursue(&self, wanted_mps: f32, velocity_mps: f32) -> f32 {
+        (wanted_mps + self.damping * (wanted_mps - velocity_mps)).clamp(-1.0, 1.0)
+    }
 }
 
 /// Distance that the tail has flown behind a wall before the oracle leaves its opening, m. A policy
@@ -74,6 +80,13 @@ pub(crate) const HOVER_BEHIND_START_M: f32 = DRONE_WIDTH_M / 2.0 + LEAST_WAIT_M;
 /// them, m.
 pub(crate) const HOVER_BEHIND_WALL_M: f32 = DRONE_WIDTH_M + HOLD_M + WAIT_MARGIN_M + LEAST_WAIT_M;
 
+/// Distance that the oracle looks ahead along the way through a world, m.
+const AHEAD_M: f32 = 2.0;
+
+/// Least distance and speed with which it reckons when it will be there, m and m/s.
+const NEAR_M: f32 = 0.5;
+const SLOW_MPS: f32 = 0.5;
+
 /// The expert on one course.
 pub(crate) struct Oracle<'a> {
     pub(crate) course: &'a Course,
@@ -86,30 +99,19 @@ impl Oracle<'_> {
     /// Returns the motion to command in `state`, with the tail at `tail_x_m` along the corridor.
     ///
     /// It flies to the next opening's safe point, then, behind the last wall, to the middle of the
-    /// corridor, where a gust has the longest way to blow it into anything.
+    /// corridor, where a gust has the longest way to blow it into anything. In a world, it flies
+    /// along the way to the goal, as far ahead as nothing stands between. It takes no notice of what
+    /// moves.
     pub(crate) fn command(&self, tail_x_m: f32, state: &VehicleState) -> Command {
-        let walls_behind = self.course.walls_before(tail_x_m - HOLD_M);
-        let middle = [0.0, self.course.corridor().height_m / 2.0];
-        let next = self.course.walls().get(walls_behind);
-        let [y_m, z_m] = next.map_or(middle, Wall::safe_point);
         let turns = self.vehicle.action.axes().contains(&Axis::YawRate);
         let velocity = match turns {
             true => state.velocity_mps,
             false => state.heading_velocity_mps(),
         };
-        let forward = match self.vehicle.action {
-            ActionSpace::Lateral => self.vehicle.forward_speed_mps,
-            ActionSpace::Velocity | ActionSpace::VelocityYaw => {
-                let ahead_m = self.stop_x_m(walls_behind, state) - state.position_m.x;
-                let most = self.vehicle.max_speed_mps;
-                LEVEL.velocity(ahead_m, velocity.x).min(most)
-            }
+        let wanted = match self.course.aim_m(&state.position_m, AHEAD_M) {
+            Some(aim_m) => self.along_way(&(aim_m - state.position_m), &velocity),
+            None => self.through_openings(tail_x_m, state, &velocity),
         };
-        let wanted = Vector3::new(
-            forward,
-            LEVEL.velocity(y_m - state.position_m.y, velocity.y),
-            UPWARDS.velocity(z_m - state.position_m.z, velocity.z),
-        );
         if !turns {
             return Command {
                 velocity_mps: wanted,
@@ -120,6 +122,47 @@ impl Oracle<'_> {
         Command {
             velocity_mps: state.in_heading_frame(&wanted.map(|axis| axis.clamp(-1.0, 1.0))),
             yaw_rate_radps: -STRAIGHTEN_PER_SEC * yaw_rad,
+        }
+    }
+
+    /// Returns the velocity towards a point of the way that lies `to_aim_m` away.
+    fn along_way(&self, to_aim_m: &Vector3<f32>, velocity: &Vector3<f32>) -> Vector3<f32> {
+        let secs = to_aim_m.x.max(NEAR_M) / velocity.x.max(SLOW_MPS);
+        Vector3::new(
+            self.forward(to_aim_m.x, velocity.x),
+            LEVEL.pursue(to_aim_m.y / secs, velocity.y),
+            UPWARDS.pursue(to_aim_m.z / secs, velocity.z),
+        )
+    }
+
+    /// Returns the velocity through the next opening of a corridor.
+    fn through_openings(
+        &self,
+        tail_x_m: f32,
+        state: &VehicleState,
+        velocity: &Vector3<f32>,
+    ) -> Vector3<f32> {
+        let at_m = &state.position_m;
+        let walls_behind = self.course.walls_behind(at_m, tail_x_m - HOLD_M);
+        let middle = [0.0, self.course.corridor().height_m / 2.0];
+        let next = self.course.walls().get(walls_behind);
+        let [y_m, z_m] = next.map_or(middle, Wall::safe_point);
+        let ahead_m = self.stop_x_m(walls_behind, state) - at_m.x;
+        Vector3::new(
+            self.forward(ahead_m, velocity.x),
+            LEVEL.velocity(y_m - at_m.y, velocity.y),
+            UPWARDS.velocity(z_m - at_m.z, velocity.z),
+        )
+    }
+
+    /// Returns the velocity forward for a drone that is to stop in `ahead_m`, if it can.
+    fn forward(&self, ahead_m: f32, velocity_mps: f32) -> f32 {
+        match self.vehicle.action {
+            ActionSpace::Lateral => self.vehicle.forward_speed_mps,
+            ActionSpace::Velocity | ActionSpace::VelocityYaw => {
+                let most = self.vehicle.max_speed_mps;
+                LEVEL.velocity(ahead_m, velocity_mps).min(most)
+            }
         }
     }
 

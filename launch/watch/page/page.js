@@ -326,7 +326,8 @@ async function flights() {
   };
   const start = place(last);
   Object.assign(drone, { x: start.x[0], y: start.y[0], z: start.z[0] });
-  const walls = course.walls.map(wallMesh);
+  const obstacles = course.obstacles_m.length ? [{ triangles_m: course.obstacles_m }] : [];
+  const walls = [...course.walls, ...obstacles].map(wallMesh);
   slider.addEventListener("input", () => {
     const step = Number(slider.value);
     const to = wayOf(flight, step);

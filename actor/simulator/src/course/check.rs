@@ -309,7 +309,7 @@ pub(super) fn leads_on(course: &Course, next_x_m: f32) -> Result<(), CourseFault
     })
 }
 
-fn in_range(
+pub(super) fn in_range(
     location: FaultLocation,
     key: &'static str,
     value: f32,

@@ -132,9 +132,15 @@ impl Simulator {
         disturbances: &mut impl Rng,
     ) -> Result<(), NoSuchLevel> {
         let position_m = self.course.start_position(level, start)?;
+        // A corridor's episodes draw nothing more.
+        let motion_seed = match self.course.obstacles() {
+            [] => 0,
+            _ => start.next_u64(),
+        };
         let drawn = DrawnDisturbances::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
-        self.world.reset(&position_m, drawn.mass_factor);
+        self.world
+            .reset(&position_m, drawn.mass_factor, motion_seed);
         let DrawnDisturbances {
             disturbed,
             mass_factor,
@@ -204,6 +210,7 @@ impl Simulator {
     /// belong to the step: rendering twice gives the same image.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
         let pose = self.world.state().pose();
+        self.camera.move_obstacles(self.world.moment());
         match self.episode.depth_seed {
             Some(seed) => {
                 let key = seed ^ u64::from(self.episode.steps);
@@ -236,11 +243,11 @@ impl Simulator {
     pub fn ground_truth(&self) -> GroundTruth {
         let state = self.state();
         let corridor = self.course.corridor();
-        let [x_m, y_m, z_m] = state.position_m.coords.into();
+        let [_, y_m, z_m] = state.position_m.coords.into();
         GroundTruth {
             ahead: OpeningAhead::next_two(&self.course, self.walls_left(), &state),
             from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
-            to_end_m: corridor.length_m - x_m,
+            to_end_m: self.course.to_end_m(&state.position_m),
             mass_factor: self.episode.mass_factor,
             latency_periods: self.commands.periods() as f32,
             gust_n: self
@@ -337,13 +344,18 @@ impl Simulator {
         match self.world.touched_wall() {
             // A course has at most `MAX_WALLS` walls.
             Some(place) => Obstacle::Wall(place as u8 + 1),
+            // An obstacle of a world is named by its stage.
+            None if self.world.touches_obstacle() => {
+                Obstacle::Wall(self.level().min(self.course.levels()))
+            }
             None => Obstacle::Corridor,
         }
     }
 
-    /// Returns the number of walls that the whole body is clear of.
+    /// Returns the number of walls that the whole body is clear of, or of stages behind it.
     fn walls_left(&self) -> usize {
-        self.course.walls_before(self.world.tail_x_m())
+        let position_m = self.world.state().position_m;
+        self.course.walls_behind(&position_m, self.world.tail_x_m())
     }
 
     fn abort(&mut self, what: &'static str) -> SimulationError {

@@ -29,7 +29,7 @@ fn turn(preset: Preset, command: &Command, secs: f32) -> (f32, Vec<VehicleState>
     let (_, dt_secs) = settings.physics_steps();
     let mut vehicle = Vehicle::trimmed(&settings);
     let mut world = World::new(&test_course(), vehicle.body(), dt_secs).unwrap();
-    world.reset(&Point3::new(1.5, 0.0, 3.5), 1.0);
+    world.reset(&Point3::new(1.5, 0.0, 3.5), 1.0, 0);
     let states = (0..(secs / dt_secs) as usize)
         .map(|_| {
             let actuation = vehicle.actuate(&world.state(), command, dt_secs);

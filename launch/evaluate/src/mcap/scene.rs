@@ -1,4 +1,4 @@
-//! Scene that a viewer draws in 3-D: the corridor, its walls, the drone and its trail, the frames.
+//! Scene that a viewer draws in 3-D: the corridor, its walls, still obstacles, the drone and its trail, the frames.
 
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
@@ -39,6 +39,17 @@ pub(super) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpd
                 EDGE,
             )],
             ..entity(WORLD, format!("wall {number}"), at)
+        });
+    }
+    let obstacles = course.obstacle_triangles();
+    if !obstacles.is_empty() {
+        entities.push(SceneEntity {
+            triangles: vec![TriangleListPrimitive {
+                pose: Some(Pose::origin()),
+                points: obstacles.into_iter().flatten().map(Vector3::from).collect(),
+                color: Some(Color::rgba(WALL)),
+            }],
+            ..entity(WORLD, "obstacles".to_owned(), at)
         });
     }
     if let Some(first) = entities.first_mut() {
