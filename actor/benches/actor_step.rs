@@ -25,7 +25,7 @@ use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::{IMAGE_PIXELS, MAX_ACTION};
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::{Courses, Simulators};
 use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink};
@@ -157,7 +157,7 @@ fn inference(
                 observation_layout.write_step(
                     &record.latent,
                     &record.velocity_mps,
-                    &[0.0; ACTION],
+                    &[0.0; MAX_ACTION],
                     &mut observed,
                 );
                 black_box(

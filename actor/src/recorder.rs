@@ -20,7 +20,7 @@ use skein_protocol::ids::EpisodeId;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
-use skein_protocol::transition::{Outcome, TransitionRecord};
+use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
 use skein_recordings::{Episode, Recording};
 use skein_rollout::courses::Courses;
 use skein_rollout::environment_loop::{Directive, RecordLink};
@@ -90,10 +90,10 @@ impl Recorder {
             return Ok(None);
         };
         let (to_writer, inbox) = sync_channel(QUEUE);
-        let latent = config.vae.latent;
+        let lengths = config.record_lengths();
         let writer = thread::Builder::new()
             .name("recorder".to_owned())
-            .spawn(move || write_all(&inbox, &folder, &courses, latent))?;
+            .spawn(move || write_all(&inbox, &folder, &courses, lengths))?;
         Ok(Some(Self {
             choice: Choice {
                 every,
@@ -201,14 +201,14 @@ impl<L: RecordLink> RecordLink for Tapped<'_, L> {
 }
 
 /// Body of the writing thread.
-fn write_all(inbox: &Receiver<Flown>, folder: &Path, courses: &Courses, latent: usize) {
+fn write_all(inbox: &Receiver<Flown>, folder: &Path, courses: &Courses, lengths: RecordLengths) {
     // On Linux, a priority is the thread's own.
     if let Err(error) = setpriority_process(None, NICE) {
         debug!(%error, "the recorder keeps its priority");
     }
     for flown in inbox {
         let name = name(&flown.ticket, &flown.score);
-        if let Err(error) = write(&flown, &folder.join(&name), courses, latent) {
+        if let Err(error) = write(&flown, &folder.join(&name), courses, lengths) {
             warn!(%error, recording = name, "not recorded");
         }
         if let Err(error) = drop_oldest(folder, MOST_RECORDINGS, MOST_BYTES) {
@@ -233,7 +233,7 @@ fn name(ticket: &Ticket, score: &EpisodeScore) -> String {
     format!("{episode}-{outcome}-{walls_passed}of{walls}.{EXTENSION}")
 }
 
-fn write(flown: &Flown, path: &Path, courses: &Courses, latent: usize) -> io::Result<()> {
+fn write(flown: &Flown, path: &Path, courses: &Courses, lengths: RecordLengths) -> io::Result<()> {
     let (course, settings) = courses.course(&flown.ticket).map_err(io::Error::other)?;
     let (title, number) = match flown.ticket.episode.in_evaluation() {
         Some((evaluation, number)) => (
@@ -254,10 +254,10 @@ fn write(flown: &Flown, path: &Path, courses: &Courses, latent: usize) -> io::Re
         title: &title,
         course: (&course, 0),
         number,
-        latent,
+        lengths,
         score: flown.score,
     };
-    let written = Recording::create(&unfinished, settings, &[course.name()])
+    let written = Recording::create(&unfinished, settings, lengths.action, &[course.name()])
         .and_then(|mut recording| {
             recording.add(&episode, &flown.records)?;
             recording.finish()

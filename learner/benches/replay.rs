@@ -11,7 +11,7 @@ use skein_learner::replay::{Minibatch, Replay};
 use skein_protocol::config::{Config, Observation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, MAX_LATENT, REWARD_TERMS};
+use skein_protocol::{GROUND_TRUTH, MAX_ACTION, MAX_LATENT, REWARD_TERMS};
 
 /// Transitions per minibatch.
 const BATCH: usize = 256;
@@ -67,7 +67,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
         actor: ActorId(0),
         level: 1,
         first_step: 0,
-        action_before: [0.0; ACTION],
+        action_before: [0.0; MAX_ACTION],
         observations: (0..=STEPS)
             .map(|_| StepObservation {
                 latent: [(); MAX_LATENT].map(|()| draw()),
@@ -78,7 +78,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
             })
             .collect(),
         actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
-        teacher_actions: vec![[0.0; ACTION]; STEPS],
+        teacher_actions: vec![[0.0; MAX_ACTION]; STEPS],
         rewards: (0..STEPS).map(|_| draw()).collect(),
         reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
         level_up: (0..STEPS).map(|step| step % STEPS_PER_WALL == 0).collect(),

@@ -9,11 +9,10 @@ use skein_learner::algorithm::{Algorithm, Columns, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::noise::Noise;
 use skein_learner::sac::{NativeSac, TorchSac};
-use skein_protocol::ACTION;
 use skein_protocol::config::{Engine, SacSection};
 use tch::Device;
 
-use common::{OBSERVATION, Transitions};
+use common::{ACTION, OBSERVATION, Transitions};
 
 /// Default width of hidden layers.
 const WIDTH: usize = 256;

@@ -10,7 +10,7 @@ use std::fmt;
 
 use skein_kernels::Team;
 use skein_protocol::config::{Config, CriticInput};
-use skein_protocol::{ACTION, CRITIC_STATE, IMAGE_PIXELS};
+use skein_protocol::{ActionSpace, IMAGE_PIXELS, critic_state};
 
 use crate::error::UpdateError;
 use crate::metrics::Scalar;
@@ -72,6 +72,8 @@ pub struct Inputs {
     pub policy: usize,
     /// Width of the critic's input, the action not counted.
     pub critic: usize,
+    /// Numbers of an action.
+    pub action: ActionSpace,
     /// Number of leading inputs that an encoder trained end to end computes from the images in each
     /// update; `None` where the latent code is the VAE's.
     pub from_image: Option<usize>,
@@ -82,22 +84,25 @@ impl Inputs {
     pub fn of(config: &Config) -> Self {
         let same = Self {
             from_image: config.learning.end_to_end().then_some(config.vae.latent),
+            action: config.action_space(),
             ..Self::same(config.observation_layout().len())
         };
         match config.learning.critic_input {
             CriticInput::Observation => same,
             CriticInput::GroundTruth => Self {
-                critic: CRITIC_STATE,
+                critic: critic_state(same.action),
                 ..same
             },
         }
     }
 
-    /// Policy and critic both see an observation of this width, the VAE's latent code included.
+    /// Policy and critic both see an observation of this width, the VAE's latent code included;
+    /// actions are lateral.
     pub fn same(observation: usize) -> Self {
         Self {
             policy: observation,
             critic: observation,
+            action: ActionSpace::Lateral,
             from_image: None,
         }
     }
@@ -108,7 +113,7 @@ impl Inputs {
 pub struct Columns<'a> {
     /// Observations before the action, `[rows, observation]`.
     pub observations: &'a [f32],
-    /// Actions, `[rows, 2]`.
+    /// Actions, `[rows, action]`.
     pub actions: &'a [f32],
     /// Rewards, `[rows]`.
     pub rewards: &'a [f32],
@@ -126,7 +131,7 @@ pub struct Columns<'a> {
     /// encoder is trained end to end: its codes change with every update, so the replay cannot
     /// store them.
     pub images: Option<[&'a [u8]; 2]>,
-    /// The teacher's actions for the observations before the action, `[rows, 2]`. Present only
+    /// The teacher's actions for the observations before the action, `[rows, action]`. Present only
     /// where there is a teacher.
     pub teacher_actions: Option<&'a [f32]>,
 }
@@ -141,15 +146,17 @@ impl Columns<'_> {
         assert!(rows > 0, "a minibatch has at least one transition");
         for (column, width) in [
             (self.observations, inputs.policy),
-            (self.actions, ACTION),
+            (self.actions, inputs.action.numbers()),
             (self.next_observations, inputs.policy),
             (self.states, inputs.critic),
             (self.next_states, inputs.critic),
             (self.terminated, 1),
         ]
         .into_iter()
-        .chain(self.teacher_actions.map(|actions| (actions, ACTION)))
-        {
+        .chain(
+            self.teacher_actions
+                .map(|actions| (actions, inputs.action.numbers())),
+        ) {
             let len = column.len();
             assert_eq!(
                 len,

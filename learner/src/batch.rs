@@ -1,6 +1,5 @@
 //! A minibatch as tensors: what algorithms on libtorch learn from.
 
-use skein_protocol::ACTION;
 use tch::{Device, Tensor};
 
 use crate::algorithm::{Columns, Inputs};
@@ -34,11 +33,12 @@ impl TensorBatch {
         let column = |values: &[f32], shape: &[i64]| {
             Tensor::from_slice(values).view(shape).to_device(device)
         };
-        let [observation, state] = [inputs.policy, inputs.critic].map(|width| width as i64);
+        let widths = [inputs.policy, inputs.critic, inputs.action.numbers()];
+        let [observation, state, action] = widths.map(|width| width as i64);
         let seen = |bytes| pixels(&images_from_bytes(bytes).to_device(device));
         Self {
             observations: column(columns.observations, &[rows, observation]),
-            actions: column(columns.actions, &[rows, ACTION as i64]),
+            actions: column(columns.actions, &[rows, action]),
             rewards: column(columns.rewards, &[rows]),
             next_observations: column(columns.next_observations, &[rows, observation]),
             states: column(columns.states, &[rows, state]),
@@ -47,7 +47,7 @@ impl TensorBatch {
             images: columns.images.map(|images| images.map(seen)),
             teacher_actions: columns
                 .teacher_actions
-                .map(|actions| column(actions, &[rows, ACTION as i64])),
+                .map(|actions| column(actions, &[rows, action])),
         }
     }
 

@@ -3,7 +3,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::ACTION;
+use skein_protocol::Action;
 use skein_protocol::config::{Config, ConfirmOn};
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
 use skein_protocol::seeds::{Purpose, derive};
@@ -27,7 +27,7 @@ pub(crate) fn training(
     config: &Config,
     run: RunId,
     order: &EpochOrder,
-    flown: &[[f32; ACTION]],
+    flown: &[Action],
 ) -> Vec<Ticket> {
     let first = order.epoch * config.learning.episodes_per_epoch;
     let end = (first + config.learning.episodes_per_epoch).min(config.run.episodes);

@@ -7,7 +7,6 @@
 //! kernels, whose bits depend neither on the instruction set nor on the number of threads.
 
 use skein_kernels::{Isa, Team};
-use skein_protocol::ACTION;
 use skein_protocol::config::DistillSection;
 use skein_protocol::seeds::{Purpose, derive};
 
@@ -44,11 +43,7 @@ impl Distill {
     /// The first update panics when this machine lacks the instructions of `isa`.
     pub(crate) fn new(section: &DistillSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let mut layout = Layout::default();
-        PolicyNetwork::describe(
-            &mut layout,
-            inputs.policy as i64,
-            section.hidden_width as i64,
-        );
+        PolicyNetwork::describe(&mut layout, inputs, section.hidden_width as i64);
         let values = layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         Self {
             isa,
@@ -93,18 +88,14 @@ impl Algorithm for Distill {
         );
         let outputs = output(&self.activations);
         let grad = output_mut(&mut self.grad);
-        for (grad, output) in grad
-            .chunks_exact_mut(ACTION)
-            .zip(outputs.chunks_exact(ACTION))
-        {
-            for (grad, output) in grad.iter_mut().zip(output) {
-                *grad = 2.0 * (output - self.log_std) / rows as f32;
-            }
+        let action = self.inputs.action.numbers();
+        for (grad, output) in grad.iter_mut().zip(outputs) {
+            *grad = 2.0 * (output - self.log_std) / rows as f32;
         }
-        for means in grad.chunks_exact_mut(2 * ACTION) {
-            means[..ACTION].fill(0.0);
+        for row in grad.chunks_exact_mut(2 * action) {
+            row[..action].fill(0.0);
         }
-        let distance = imitate(outputs, teacher, 1.0, grad);
+        let distance = imitate(outputs, teacher, action, 1.0, grad);
         policy.backward(team, &parameters.values, &self.activations, &mut self.grad);
         policy.gradient(
             team,

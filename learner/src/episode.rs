@@ -6,9 +6,10 @@
 //! segment is a [`CommittedEpisode`], and so are the segments so far, joined.
 
 use skein_protocol::config::ObservationLayout;
+use skein_protocol::heading::heading;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
+use skein_protocol::{Action, ActionSpace, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
 
 /// Observation and pose of the vehicle at the beginning of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,13 +56,13 @@ pub struct CommittedEpisode {
     /// Steps of the episode before these; 0 if the episode is whole.
     pub first_step: usize,
     /// Action before the first step; zero at the reset.
-    pub action_before: [f32; ACTION],
+    pub action_before: Action,
     /// Observations, `[T + 1]`, the closing one last.
     pub observations: Vec<StepObservation>,
-    /// Lateral and vertical velocity commands, each in [-1, 1]; `[T]`.
-    pub actions: Vec<[f32; ACTION]>,
+    /// Actions, each number in [-1, 1]; `[T]`.
+    pub actions: Vec<Action>,
     /// The teacher's actions for the same observations; zero where none was asked. `[T]`.
-    pub teacher_actions: Vec<[f32; ACTION]>,
+    pub teacher_actions: Vec<Action>,
     /// Rewards, `[T]`.
     pub rewards: Vec<f32>,
     /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
@@ -166,12 +167,13 @@ impl CommittedEpisode {
         view.write(step, into, |step, into| self.write_moment(step, view, into));
     }
 
-    /// Writes the critic's input at the beginning of `step`, `[CRITIC_STATE]`, where the critic
-    /// sees the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
+    /// Writes the critic's input at the beginning of `step`, `[critic_state(action)]`, where the
+    /// critic sees the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
     ///
-    /// It holds the ground truth, the velocity, the tilt, and the action before, which under
-    /// latency has yet to take effect. Each number is roughly within [-2, 2].
-    pub fn write_critic_state(&self, step: usize, into: &mut [f32]) {
+    /// It holds the ground truth, the velocity, the tilt, the heading of a drone that turns, and the
+    /// action before, which under latency has yet to take effect. Each number is roughly within
+    /// [-2, 2].
+    pub fn write_critic_state(&self, step: usize, action: ActionSpace, into: &mut [f32]) {
         let seen = &self.observations[step];
         let [roll, pitch, ..] = seen.orientation;
         let truth = seen
@@ -183,13 +185,20 @@ impl CommittedEpisode {
             .velocity_mps
             .into_iter()
             .chain([10.0 * roll, 10.0 * pitch]);
-        let all = truth.chain(motion).chain(self.action_before(step));
+        let turned = match action {
+            ActionSpace::Lateral | ActionSpace::Velocity => None,
+            ActionSpace::VelocityYaw => Some(heading(seen.orientation)),
+        };
+        let all = truth
+            .chain(motion)
+            .chain(turned.into_iter().flatten())
+            .chain(self.action_before(step));
         into.iter_mut()
             .zip(all)
             .for_each(|(into, value)| *into = value);
     }
 
-    fn action_before(&self, step: usize) -> [f32; ACTION] {
+    fn action_before(&self, step: usize) -> Action {
         step.checked_sub(1)
             .map_or(self.action_before, |previous| self.actions[previous])
     }
@@ -197,7 +206,13 @@ impl CommittedEpisode {
     fn write_moment(&self, step: usize, view: &ObservationLayout, into: &mut [f32]) {
         let previous_action = self.action_before(step);
         let seen = &self.observations[step];
-        view.write_step(&seen.latent, &seen.velocity_mps, &previous_action, into);
+        view.write_step(
+            &seen.latent,
+            &seen.velocity_mps,
+            &seen.orientation,
+            &previous_action,
+            into,
+        );
     }
 
     /// Checks that there is a step, and that every part is as long as the number of actions
@@ -238,6 +253,8 @@ impl CommittedEpisode {
 pub(crate) mod samples {
     //! Episodes for tests, every number in them recognisable.
 
+    use skein_protocol::MAX_ACTION;
+
     use super::*;
 
     /// An episode of `steps` steps, in which every number is a function of (`episode`, step). Image
@@ -251,7 +268,7 @@ pub(crate) mod samples {
             actor: ActorId(0),
             level: 1,
             first_step: 0,
-            action_before: [0.0; ACTION],
+            action_before: [0.0; MAX_ACTION],
             observations: (0..=steps)
                 .map(|step| StepObservation {
                     latent: code(shade(episode, step)),
@@ -262,10 +279,10 @@ pub(crate) mod samples {
                 })
                 .collect(),
             actions: (0..steps)
-                .map(|step| [at(step) / 1e6, -at(step) / 1e6])
+                .map(|step| [1e6, -1e6, 4e6, -5e6].map(|size| at(step) / size))
                 .collect(),
             teacher_actions: (0..steps)
-                .map(|step| [at(step) / 2e6, -at(step) / 3e6])
+                .map(|step| [2e6, -3e6, 6e6, -7e6].map(|size| at(step) / size))
                 .collect(),
             rewards: (0..steps).map(|step| at(step) / 100.0).collect(),
             reward_terms: vec![[0.0; REWARD_TERMS]; steps],
@@ -302,8 +319,8 @@ pub(crate) mod samples {
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::CRITIC_STATE;
     use skein_protocol::config::Observation;
+    use skein_protocol::critic_state;
 
     use super::*;
 
@@ -336,11 +353,11 @@ mod tests {
     fn the_previous_action_is_zero_at_reset_and_then_the_one_before() {
         let episode = samples::episode(3, 5, Outcome::Collided);
         let view = ObservationLayout::present(Observation::LatentVelocityAction, 16);
-        let mut vector = [f32::NAN; 16 + 2 + ACTION];
+        let mut vector = [f32::NAN; 16 + 2 + 2];
         episode.write_observation(0, &view, &mut vector);
         assert_eq!(vector[18..], [0.0, 0.0]);
         episode.write_observation(5, &view, &mut vector);
-        assert_eq!(vector[18..], episode.actions[4]);
+        assert_eq!(vector[18..], episode.actions[4][..2]);
         assert_eq!(vector[..16], episode.observations[5].latent[..16]);
         assert_eq!(vector[16..18], episode.observations[5].velocity_mps[1..]);
     }
@@ -349,9 +366,8 @@ mod tests {
     fn earlier_moments_follow_the_present_and_before_reset_all_was_as_at_reset() {
         let episode = samples::episode(3, 5, Outcome::Collided);
         let view = ObservationLayout {
-            per_step: Observation::LatentVelocity,
-            latent: 8,
             history_steps: vec![1, 4],
+            ..ObservationLayout::present(Observation::LatentVelocity, 8)
         };
         let mut vector = vec![f32::NAN; view.len()];
         for (step, moments) in [(5, [5, 4, 1]), (2, [2, 1, 0]), (0, [0, 0, 0])] {
@@ -367,15 +383,15 @@ mod tests {
     #[test]
     fn the_true_state_is_the_ground_truth_the_motion_and_the_action_before() {
         let episode = samples::episode(3, 5, Outcome::Collided);
-        let mut state = [f32::NAN; CRITIC_STATE];
-        episode.write_critic_state(4, &mut state);
+        let mut state = vec![f32::NAN; critic_state(ActionSpace::Lateral)];
+        episode.write_critic_state(4, ActionSpace::Lateral, &mut state);
         let seen = &episode.observations[4];
         assert_eq!(state[0], seen.ground_truth[0] * TRUTH_SCALE[0]);
         assert_eq!(state[15], seen.ground_truth[15] * TRUTH_SCALE[15]);
         assert_eq!(state[GROUND_TRUTH..GROUND_TRUTH + 3], seen.velocity_mps);
-        let before = CRITIC_STATE - ACTION;
-        assert_eq!(state[before..], episode.actions[3]);
-        episode.write_critic_state(0, &mut state);
+        let before = state.len() - 2;
+        assert_eq!(state[before..], episode.actions[3][..2]);
+        episode.write_critic_state(0, ActionSpace::Lateral, &mut state);
         assert_eq!(state[before..], [0.0, 0.0]);
     }
 

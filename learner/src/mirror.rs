@@ -5,7 +5,7 @@
 //! left of near objects. In the mirror they lie to the right, as if its second lens were on the
 //! other side.
 
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_WIDTH};
+use skein_protocol::{ActionSpace, GROUND_TRUTH, IMAGE_WIDTH};
 
 use crate::episode::{CommittedEpisode, StepObservation};
 
@@ -14,18 +14,15 @@ use crate::episode::{CommittedEpisode, StepObservation};
 const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
 impl CommittedEpisode {
-    /// Returns the mirrored episode. Its latent codes are still the unmirrored ones: a caller that
+    /// Returns the mirrored episode, flown with the numbers of `action`. Its latent codes are still the unmirrored ones: a caller that
     /// needs codes encodes the mirrored images.
     #[must_use]
-    pub fn mirrored(&self) -> Self {
+    pub fn mirrored(&self, action: ActionSpace) -> Self {
         let mut mirrored = self.without_images();
-        mirrored.action_before = turn(self.action_before);
-        for action in mirrored
-            .actions
-            .iter_mut()
-            .chain(&mut mirrored.teacher_actions)
-        {
-            *action = turn(*action);
+        mirrored.action_before = action.mirrored(&self.action_before);
+        let taken = mirrored.actions.iter_mut();
+        for taken in taken.chain(&mut mirrored.teacher_actions) {
+            *taken = action.mirrored(taken);
         }
         mirrored.observations.iter_mut().for_each(mirror);
         mirrored.depth = self.depth.clone();
@@ -38,10 +35,6 @@ impl CommittedEpisode {
         }
         mirrored
     }
-}
-
-fn turn([left, up]: [f32; ACTION]) -> [f32; ACTION] {
-    [-left, up]
 }
 
 fn mirror(seen: &mut StepObservation) {
@@ -59,8 +52,8 @@ const _: () = assert!(TO_THE_LEFT[3] < GROUND_TRUTH);
 
 #[cfg(test)]
 mod tests {
-    use skein_protocol::IMAGE_PIXELS;
     use skein_protocol::transition::Outcome;
+    use skein_protocol::{ActionSpace, IMAGE_PIXELS};
 
     use crate::episode::samples::{episode, with_images};
 
@@ -68,9 +61,11 @@ mod tests {
     fn an_episode_in_two_mirrors_is_the_episode() {
         let mut flown = with_images(episode(3, 5, Outcome::Collided));
         flown.depth.as_mut().unwrap()[IMAGE_PIXELS..][..3].copy_from_slice(&[1, 2, 3]);
-        let mirrored = flown.mirrored();
-        assert_eq!(mirrored.check(), Ok(()));
-        assert_ne!(mirrored, flown);
-        assert_eq!(mirrored.mirrored(), flown);
+        for action in ActionSpace::ALL {
+            let mirrored = flown.mirrored(action);
+            assert_eq!(mirrored.check(), Ok(()));
+            assert_ne!(mirrored, flown);
+            assert_eq!(mirrored.mirrored(action), flown);
+        }
     }
 }

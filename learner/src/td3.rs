@@ -7,7 +7,6 @@
 //! numbers are those of the article.
 
 use skein_kernels::Team;
-use skein_protocol::ACTION;
 use skein_protocol::config::Td3Section;
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
@@ -47,7 +46,7 @@ impl Td3 {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
         let policy =
-            PolicyNetwork::with_outputs(&mut layout, inputs.policy as i64, width, ACTION as i64);
+            PolicyNetwork::with_outputs(&mut layout, inputs, width, inputs.action.numbers());
         let policy_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 0),
@@ -57,12 +56,7 @@ impl Td3 {
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = CriticNetwork::describe(
-            &mut layout,
-            inputs.critic as i64,
-            width,
-            section.critic_networks,
-        );
+        let critic = CriticNetwork::describe(&mut layout, inputs, width, section.critic_networks);
         let critic_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 1),
@@ -99,7 +93,7 @@ impl Td3 {
             .policy
             .output(&self.target_policy, &batch.next_observations)
             .tanh();
-        let drawn = noise.normal(&[batch.rows(), ACTION as i64], self.device);
+        let drawn = noise.normal(&actions.size(), self.device);
         let actions = (actions + (drawn * target_noise).clamp(-bound, bound)).clamp(-1.0, 1.0);
         let values = self
             .critic

@@ -258,9 +258,11 @@ impl Trainer {
         &self.replay
     }
 
-    /// Exploration of the next episodes to be ordered.
+    /// Exploration of the next episodes to be ordered. A policy that training starts from flies the
+    /// warm-up too.
     pub(crate) fn exploration(&self) -> Exploration {
-        if self.steps < self.config.learning.warmup_steps as u64 {
+        let learning = &self.config.learning;
+        if self.steps < learning.warmup_steps as u64 && learning.start_from.is_none() {
             Exploration::Uniform
         } else {
             Exploration::Sample
@@ -295,7 +297,9 @@ impl Trainer {
     /// [`InsertError`] when the episode's parts do not fit together.
     pub(crate) fn take_in(&mut self, mut episode: CommittedEpisode) -> Result<(), InsertError> {
         let learning = &self.config.learning;
-        let mirrored = learning.mirror.then(|| episode.mirrored());
+        let mirrored = learning
+            .mirror
+            .then(|| episode.mirrored(self.config.action_space()));
         // With policy lag, some episodes arrive after the freeze that were flown with an older
         // encoder: encode them again. Without lag, images come only for the mirror, and likewise
         // with an encoder that never changes.

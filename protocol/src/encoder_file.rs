@@ -14,7 +14,7 @@ use crate::snapshot::{
     checksum, write_tensors,
 };
 
-const FORMAT: &str = "encoder-1";
+pub(crate) const FORMAT: &str = "encoder-1";
 /// Metadata key of the number of VAE steps that trained the encoder.
 const STEPS_KEY: &str = "skein.steps";
 /// Metadata key of the version of the program that trained it.

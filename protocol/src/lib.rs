@@ -11,6 +11,7 @@ pub mod config;
 pub mod encoder_file;
 pub mod evaluation;
 pub mod files;
+pub mod heading;
 pub mod ids;
 pub mod policy_file;
 pub mod progress;
@@ -23,9 +24,11 @@ pub mod summary;
 pub mod ticket;
 pub mod transition;
 
+pub use skein_action::{Action, ActionSpace, Axis, MAX_ACTION};
+
 /// Version of everything in this crate that crosses a process boundary. It is an attribute of every
 /// service: a process of another version is refused when it opens one.
-pub const PROTOCOL_VERSION: u32 = 10;
+pub const PROTOCOL_VERSION: u32 = 11;
 
 /// Width of the depth image in pixels (paper, section 3.3).
 pub const IMAGE_WIDTH: usize = 128;
@@ -43,17 +46,22 @@ pub type LatentCode = [f32; MAX_LATENT];
 pub const REWARD_TERM_NAMES: [&str; 4] = ["collision", "level_up", "destination", "open_view"];
 /// Number of the reward's terms.
 pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
-/// Length of an action: lateral and vertical velocity, each in [-1, 1].
-pub const ACTION: usize = 2;
 /// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].
 pub const GROUND_TRUTH: usize = 18;
-/// Length of the input of a critic that sees the ground truth: ground truth, velocity `[3]`, tilt
-/// `[2]` and previous action.
-pub const CRITIC_STATE: usize = GROUND_TRUTH + 3 + 2 + ACTION;
 /// Bounds of the logarithm of a policy's standard deviation, for actor and learner alike. Beyond
 /// them tanh saturates or the noise vanishes (as in the authors' implementation of
 /// arXiv:1812.05905).
 pub const LOG_STD: (f32, f32) = (-20.0, 2.0);
+
+/// Returns the input length of a critic that sees the ground truth: ground truth, velocity `[3]`,
+/// tilt `[2]`, where the drone turns also its heading `[2]`, and the previous action.
+pub fn critic_state(action: ActionSpace) -> usize {
+    let heading = match action {
+        ActionSpace::Lateral | ActionSpace::Velocity => 0,
+        ActionSpace::VelocityYaw => 2,
+    };
+    GROUND_TRUTH + 3 + 2 + heading + action.numbers()
+}
 
 /// Returns the sizes of the records on the wire, and the reward's terms. Processes in which all are
 /// equal can read each other's records.

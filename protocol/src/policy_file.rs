@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::ActionSpace;
 use crate::config::{AlgorithmName, Config, ParameterKey};
 use crate::encoder_file::TrainedEncoder;
 use crate::snapshot::{Snapshot, SnapshotError, SnapshotLayout};
@@ -28,6 +29,17 @@ pub enum PolicyError {
         path: PathBuf,
         /// Settings of the policy that differ from this run's.
         settings: Vec<String>,
+    },
+    /// The teacher's actions are not those of this run.
+    #[error(
+        "teacher.snapshot: the policy in {} was trained with simulator.vehicle.action = \"{}\": set \
+        this here too, or name another file", path.display(), action.name()
+    )]
+    OtherAction {
+        /// The file.
+        path: PathBuf,
+        /// Numbers of the teacher's actions.
+        action: ActionSpace,
     },
     /// The policy was trained with another encoder.
     #[error(
@@ -77,11 +89,16 @@ pub fn teacher_policy(config: &Config) -> Result<Option<(Snapshot, Config)>, Pol
     let Some(path) = &config.teacher.snapshot else {
         return Ok(None);
     };
-    let loaded = Snapshot::load(path).map_err(|source| PolicyError::File {
+    let (snapshot, trained) = Snapshot::load(path).map_err(|source| PolicyError::File {
         key: ParameterKey::Teacher.name(),
         source,
-    });
-    loaded.map(Some)
+    })?;
+    let action = trained.action_space();
+    if action != config.action_space() {
+        let path = path.clone();
+        return Err(PolicyError::OtherAction { path, action });
+    }
+    Ok(Some((snapshot, trained)))
 }
 
 /// Returns the settings of `trained` that a policy depends on and that differ in `config`.
@@ -100,6 +117,7 @@ fn differences(trained: &Config, config: &Config) -> Vec<String> {
             format!("learning.observation = {}", observed(view.per_step)),
             format!("learning.history_steps = {:?}", view.history_steps),
             format!("vae.latent = {}", view.latent),
+            format!("simulator.vehicle.action = \"{}\"", view.action.name()),
             format!("hidden_width = {width}"),
         ]
     };
@@ -117,6 +135,14 @@ mod tests {
         let mut config = Config::default();
         (config.vae.latent, config.sac.hidden_width) = (8, 16);
         config
+    }
+
+    /// Sets `simulator.vehicle.action`.
+    fn act(config: &mut Config, action: &str) {
+        let vehicle = toml::Table::from_iter([("action".to_owned(), action.into())]);
+        config
+            .simulator
+            .insert("vehicle".to_owned(), vehicle.into());
     }
 
     /// Returns a configuration that starts from a snapshot of `trained` in `folder`.
@@ -157,6 +183,7 @@ mod tests {
         let mut trained = small();
         trained.learning.history_steps = vec![1, 2];
         trained.sac.hidden_width = 32;
+        act(&mut trained, "velocity");
         let (config, _) = starting(folder.path(), &trained);
         let encoder = TrainedEncoder::of(&config).unwrap();
         let error = start_policy(&config, encoder.as_ref()).unwrap_err();
@@ -166,6 +193,7 @@ mod tests {
             "policy.safetensors",
             "learning.history_steps = [1, 2]",
             "hidden_width = 32",
+            "simulator.vehicle.action = \"velocity\"",
         ] {
             assert!(error.contains(part), "{error}");
         }
@@ -180,6 +208,26 @@ mod tests {
         encoder.values[5] += 1.0;
         let error = start_policy(&config, Some(&encoder)).unwrap_err();
         assert!(matches!(error, PolicyError::OtherEncoder { .. }), "{error}");
+    }
+
+    #[test]
+    fn a_teacher_with_other_actions_is_refused_with_what_to_set() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut trained = small();
+        act(&mut trained, "velocity+yaw");
+        let (starting, _) = starting(folder.path(), &trained);
+        let mut config = small();
+        config.teacher.snapshot = starting.learning.start_from;
+        let error = teacher_policy(&config).unwrap_err().to_string();
+        for part in [
+            "teacher.snapshot",
+            "policy.safetensors",
+            "simulator.vehicle.action = \"velocity+yaw\"",
+        ] {
+            assert!(error.contains(part), "{error}");
+        }
+        act(&mut config, "velocity+yaw");
+        assert!(teacher_policy(&config).unwrap().is_some());
     }
 
     #[test]

@@ -13,9 +13,9 @@ use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::ACTION;
 use crate::ids::{ActorId, ActorIncarnation, RunId};
 use crate::ticket::{Control, ControlFault, ControlRecord, Ticket};
+use crate::{Action, MAX_ACTION};
 
 /// Most earlier actions that a segment's ticket has room for.
 pub const MAX_PRIOR_ACTIONS: usize = 256;
@@ -26,7 +26,7 @@ pub struct Segment {
     /// Steps to fly, unless the episode ends earlier.
     pub steps: u32,
     /// Actions flown earlier, from the reset on, at most [`MAX_PRIOR_ACTIONS`].
-    pub prior_actions: Arc<[[f32; ACTION]]>,
+    pub prior_actions: Arc<[Action]>,
 }
 
 /// [`Ticket`] of a segment on the wire.
@@ -37,13 +37,13 @@ pub struct SegmentRecord {
     steps: u32,
     /// Number of valid `actions`.
     prior_actions: u32,
-    actions: [[f32; ACTION]; MAX_PRIOR_ACTIONS],
+    actions: [Action; MAX_PRIOR_ACTIONS],
 }
 
 // Whole fields of eight bytes: no padding, so no uninitialised byte ever leaves the process.
 const _: () = assert!(
     size_of::<SegmentRecord>()
-        == size_of::<ControlRecord>() + 2 * 4 + MAX_PRIOR_ACTIONS * ACTION * 4
+        == size_of::<ControlRecord>() + 2 * 4 + MAX_PRIOR_ACTIONS * MAX_ACTION * 4
 );
 
 impl SegmentRecord {
@@ -58,7 +58,7 @@ impl SegmentRecord {
         actor: ActorId,
         incarnation: ActorIncarnation,
     ) -> Self {
-        let mut actions = [[0.0; ACTION]; MAX_PRIOR_ACTIONS];
+        let mut actions = [[0.0; MAX_ACTION]; MAX_PRIOR_ACTIONS];
         actions[..segment.prior_actions.len()].copy_from_slice(&segment.prior_actions);
         Self {
             ticket: ControlRecord::fly(ticket, actor, incarnation),
@@ -119,7 +119,7 @@ mod tests {
     const INCARNATION: ActorIncarnation = ActorIncarnation(8);
 
     fn ticket(flown: usize) -> Ticket {
-        let actions = (0..flown).map(|step| [step as f32 / 256.0, -1.0]);
+        let actions = (0..flown).map(|step| [step as f32 / 256.0, -1.0, 0.5, 0.0]);
         let segment = Segment {
             steps: 3,
             prior_actions: actions.collect(),
@@ -171,7 +171,7 @@ mod tests {
         ));
         // Unused actions are ignored.
         let mut record = record(2);
-        record.actions[2] = [f32::NAN; ACTION];
+        record.actions[2] = [f32::NAN; MAX_ACTION];
         assert_eq!(record.read(RUN), Ok(Control::Fly(ticket(2))));
     }
 }

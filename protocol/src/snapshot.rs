@@ -15,8 +15,9 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-use crate::ACTION;
+use crate::ActionSpace;
 use crate::config::{AlgorithmName, Config, ObservationLayout};
+use crate::encoder_file;
 use crate::files::{self, TENSOR_BYTES};
 use crate::ids::{PolicyVersion, RunId};
 
@@ -44,19 +45,20 @@ pub struct TensorSpec {
 /// Meaning of a policy's outputs, and so how actions are drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PolicyHead {
-    /// Mean and log standard deviation of a Gaussian squashed by tanh, `[2]` each.
+    /// Mean and log standard deviation of a Gaussian squashed by tanh, one each for every number
+    /// of the action.
     SquashedGaussian,
-    /// The action before tanh, `[2]`. Exploration adds noise of this standard deviation after tanh
+    /// The action before tanh. Exploration adds noise of this standard deviation after tanh
     /// and clamps the sum to [-1, 1].
     Noisy(f32),
 }
 
 impl PolicyHead {
-    /// Returns the number of outputs.
-    pub fn outputs(self) -> usize {
+    /// Returns the number of outputs of a policy with these actions.
+    pub fn outputs(self, action: ActionSpace) -> usize {
         match self {
-            Self::SquashedGaussian => 2 * ACTION,
-            Self::Noisy(_) => ACTION,
+            Self::SquashedGaussian => 2 * action.numbers(),
+            Self::Noisy(_) => action.numbers(),
         }
     }
 }
@@ -95,7 +97,7 @@ impl SnapshotLayout {
             hidden_width,
             hidden_width,
             hidden_width,
-            head.outputs(),
+            head.outputs(view.action),
         ];
         for (index, pair) in widths.windows(2).enumerate() {
             layout.push_layer(&format!("policy.layer{}", index + 1), &[pair[1], pair[0]]);
@@ -217,7 +219,7 @@ pub enum SnapshotError {
     /// The snapshot has other tensors.
     #[error(
         "the snapshot has another layout: learning.algorithm, its hidden_width, \
-        learning.observation, learning.history_steps or vae.latent differ"
+        learning.observation, learning.history_steps, vae.latent or simulator.vehicle.action differ"
     )]
     OtherLayout,
     /// The length does not match the layout.
@@ -480,6 +482,9 @@ impl<'a> ParameterFile<'a> {
 fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let file = ParameterFile::parse(bytes)?;
     let format = file.text(FORMAT_KEY)?;
+    if format == encoder_file::FORMAT {
+        return Err("it holds an encoder alone, for vae.start_from".to_owned());
+    }
     if format != FORMAT {
         return Err(format!("its format is {format}, not {FORMAT}"));
     }

@@ -10,7 +10,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::ids::{ActorId, ActorIncarnation};
 use crate::ticket::Ticket;
-use crate::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, REWARD_TERMS};
+use crate::{
+    Action, ActionSpace, GROUND_TRUTH, IMAGE_PIXELS, LatentCode, MAX_ACTION, REWARD_TERMS,
+};
 
 /// Largest magnitude in a valid record: the settings limit each term of a reward to 10⁶ and
 /// corridors to 1 km. The learner squares its inputs, and single precision ends at 3 · 10³⁸.
@@ -18,8 +20,8 @@ pub const MAX_MAGNITUDE: f32 = 1e7;
 
 /// Bytes between `hit_wall` and `ground_truth`, so that the image starts on a cache line.
 const RESERVED: usize = {
-    // 305: the header's other fields.
-    let used = size_of::<f32>() * (REWARD_TERMS + GROUND_TRUTH) + 305;
+    // 353: the header's other fields.
+    let used = size_of::<f32>() * (REWARD_TERMS + GROUND_TRUTH + 2 * MAX_ACTION) + 353;
     used.next_multiple_of(64) - used
 };
 
@@ -59,11 +61,12 @@ pub struct TransitionRecord {
     pub velocity_mps: [f32; 3],
     /// The VAE's latent mean of `depth`; zero from index `vae.latent` on.
     pub latent: LatentCode,
-    /// Lateral and vertical velocity command, each in [-1, 1].
-    pub action: [f32; ACTION],
+    /// The action, each number in [-1, 1]; zero beyond those of the run's
+    /// [`ActionSpace`](crate::ActionSpace).
+    pub action: Action,
     /// The teacher's action for the same observation, each in [-1, 1]; zero if the ticket asks for
     /// none.
-    pub teacher_action: [f32; ACTION],
+    pub teacher_action: Action,
     /// Sum of `reward_terms`.
     pub reward: f32,
     /// The terms of the reward: [`REWARD_TERM_NAMES`](crate::REWARD_TERM_NAMES).
@@ -95,6 +98,15 @@ const HEADER: usize = std::mem::offset_of!(TransitionRecord, depth);
 const _: () = assert!(HEADER.is_multiple_of(64));
 const _: () = assert!(size_of::<TransitionRecord>() == HEADER + IMAGE_PIXELS);
 const _: () = assert!(align_of::<TransitionRecord>() == 8);
+
+/// Lengths of what records have more room for than a run needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RecordLengths {
+    /// Length of the latent code.
+    pub latent: usize,
+    /// Numbers of an action.
+    pub action: ActionSpace,
+}
 
 /// Role of a record within its episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -241,17 +253,32 @@ impl TransitionRecord {
         Ok(kind)
     }
 
-    /// Checks that the latent code is not longer than `latent` numbers.
+    /// Checks that code and actions are not longer than `lengths`.
     ///
     /// # Errors
-    /// [`RecordFault::Contradiction`]; such a record was made with another encoder.
-    pub fn check_latent(&self, latent: usize) -> Result<(), RecordFault> {
-        match self.latent[latent..].iter().all(|&value| value == 0.0) {
-            true => Ok(()),
-            false => Err(RecordFault::Contradiction {
-                what: "the latent code is longer than vae.latent",
-            }),
+    /// [`RecordFault::Contradiction`]; such a record was made with another encoder or another
+    /// vehicle.
+    pub fn check_lengths(&self, lengths: RecordLengths) -> Result<(), RecordFault> {
+        let numbers = lengths.action.numbers();
+        for (beyond, what) in [
+            (
+                &self.latent[lengths.latent..],
+                "the latent code is longer than vae.latent",
+            ),
+            (
+                &self.action[numbers..],
+                "the action has more numbers than simulator.vehicle.action",
+            ),
+            (
+                &self.teacher_action[numbers..],
+                "the teacher's action has more numbers than simulator.vehicle.action",
+            ),
+        ] {
+            if beyond.iter().any(|&value| value != 0.0) {
+                return Err(RecordFault::Contradiction { what });
+            }
         }
+        Ok(())
     }
 
     fn check_numbers(&self) -> Result<(), RecordFault> {
@@ -380,7 +407,7 @@ pub enum RecordFault {
     #[error("action {action:?} is outside [-1, 1]")]
     ActionOutOfRange {
         /// The action.
-        action: [f32; ACTION],
+        action: Action,
     },
 }
 
@@ -450,7 +477,7 @@ mod tests {
         assert!(check(|r| r.ground_truth[15] = f32::NAN).contains("ground_truth"));
         assert!(check(|r| r.reward = f32::INFINITY).contains("reward is not finite"));
         assert!(check(|r| r.velocity_mps[1] = -1e8).contains("velocity_mps holds -100000000"));
-        assert!(check(|r| r.action = [0.0, 1.5]).contains("action"));
+        assert!(check(|r| r.action[1] = 1.5).contains("action"));
         assert!(check(|r| r.terminated = 2).contains("terminated"));
         assert!(check(|r| r.reward = 0.5).contains("not the sum of its terms"));
         assert!(
@@ -465,16 +492,35 @@ mod tests {
     }
 
     #[test]
-    fn a_latent_code_ends_where_the_configuration_says() {
+    fn code_and_actions_end_where_the_configuration_says() {
+        let lengths = |latent, action| RecordLengths { latent, action };
         let mut record = record();
         record.latent[..16].fill(0.5);
-        assert_eq!(record.check_latent(16), Ok(()));
-        assert_eq!(record.check_latent(MAX_LATENT), Ok(()));
+        record.action[..3].fill(0.5);
+        record.teacher_action[..3].fill(0.5);
+        let check = |record: &TransitionRecord, latent, action| {
+            let checked = record.check_lengths(lengths(latent, action));
+            checked.map_err(|fault| fault.to_string())
+        };
+        for (latent, action) in [
+            (16, ActionSpace::Velocity),
+            (MAX_LATENT, ActionSpace::VelocityYaw),
+        ] {
+            assert_eq!(check(&record, latent, action), Ok(()));
+        }
         for value in [1e-30, f32::NAN] {
             record.latent[15] = value;
-            let refused = record.check_latent(15).unwrap_err().to_string();
+            let refused = check(&record, 15, ActionSpace::Velocity).unwrap_err();
             assert!(refused.contains("longer than vae.latent"), "{refused}");
         }
+        let refused = check(&record, 16, ActionSpace::Lateral).unwrap_err();
+        assert!(refused.starts_with("the action has more"), "{refused}");
+        record.action[2] = 0.0;
+        let refused = check(&record, 16, ActionSpace::Lateral).unwrap_err();
+        assert!(
+            refused.starts_with("the teacher's action has more"),
+            "{refused}"
+        );
     }
 
     #[test]

@@ -14,7 +14,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{
     ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
 };
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_LATENT};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH, LatentCode, MAX_ACTION, MAX_LATENT};
 use tch::Device;
 
 /// Settings of `one-course.toml`.
@@ -39,7 +39,13 @@ fn main() {
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
     let mut observation = vec![0.0; view.len()];
     let mut observe = |latent: LatentCode| {
-        view.write_step(&latent, &[1.0, 0.1, 0.1], &[0.0; ACTION], &mut observation);
+        view.write_step(
+            &latent,
+            &[1.0, 0.1, 0.1],
+            &[0.0, 0.0, 0.0, 1.0],
+            &[0.0; MAX_ACTION],
+            &mut observation,
+        );
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");
@@ -77,6 +83,6 @@ fn operations(layout: &ObservationLayout, width: usize) -> u64 {
         products += size[0] * size[1] * ENCODER_KERNEL * ENCODER_KERNEL * channels[0] * channels[1];
     }
     products += ENCODER_FEATURES * layout.latent;
-    products += layout.len() * width + 2 * width * width + width * 2 * ACTION;
+    products += layout.len() * width + 2 * width * width + width * 2 * layout.action.numbers();
     2 * products as u64
 }

@@ -58,6 +58,28 @@ fn actors_that_fly_during_updates_change_nothing() {
 }
 
 #[test]
+fn all_numbers_of_an_action_and_all_parts_of_an_observation_are_learned_bit_for_bit() {
+    let whole = || {
+        RunRecipe::small()
+            .set("simulator.vehicle.action=velocity+yaw")
+            .set("simulator.vehicle.max_speed_mps=2.0")
+            .set("simulator.reward.progress=0.1")
+            .set("learning.observation=latent+velocity+action+goal")
+            .set("learning.critic_input=ground-truth")
+            .set("learning.mirror=true")
+    };
+    let alone = whole().actors(1).finish();
+    let together = whole().actors(3).finish();
+    assert!(
+        crew(&together).len() > 1,
+        "only one actor flew, so the test shows nothing"
+    );
+    together
+        .learned()
+        .assert_same(&alone.learned(), "three actors");
+}
+
+#[test]
 fn an_actor_killed_in_the_middle_changes_nothing() {
     // Long enough for the actor's second incarnation.
     let long = || RunRecipe::small().set("run.episodes=150");

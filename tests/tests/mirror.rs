@@ -7,7 +7,7 @@ use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_learner::episode::{CommittedEpisode, StepObservation};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
-use skein_protocol::{ACTION, IMAGE_PIXELS, MAX_LATENT, REWARD_TERMS};
+use skein_protocol::{ActionSpace, IMAGE_PIXELS, MAX_ACTION, MAX_LATENT, REWARD_TERMS};
 use skein_simulator::course::{
     Corridor, Course, CourseLayout, Opening, Shape, StartArea, WallLabel, WallLayout,
 };
@@ -57,9 +57,11 @@ fn course(side: f32) -> Course {
     .expect("the course can be flown")
 }
 
-fn fly(side: f32) -> CommittedEpisode {
-    let mut simulator = Simulator::new(Arc::new(course(side)), &SimulatorSettings::default())
-        .expect("the default settings are sound");
+fn fly(side: f32, space: ActionSpace) -> CommittedEpisode {
+    let mut settings = SimulatorSettings::default();
+    settings.vehicle.action = space;
+    let mut simulator =
+        Simulator::new(Arc::new(course(side)), &settings).expect("the settings are sound");
     let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
     simulator
         .reset(1, &mut start, &mut calm)
@@ -81,7 +83,12 @@ fn fly(side: f32) -> CommittedEpisode {
         if step < STEPS {
             let phase = step as f32;
             let taught = simulator.oracle_action();
-            let action = [side * (0.7 * phase).sin(), (0.4 * phase).cos()];
+            let (left, up) = (side * (0.7 * phase).sin(), (0.4 * phase).cos());
+            let action = match space {
+                ActionSpace::Lateral => [left, up, 0.0, 0.0],
+                ActionSpace::Velocity => [0.8, left, up, 0.0],
+                ActionSpace::VelocityYaw => [0.8, left, up, side * (0.3 * phase).sin()],
+            };
             simulator.step(action).expect("nothing is hit so soon");
             actions.push(action);
             teacher_actions.push(taught);
@@ -94,7 +101,7 @@ fn fly(side: f32) -> CommittedEpisode {
         actor: ActorId(0),
         level: 1,
         first_step: 0,
-        action_before: [0.0; ACTION],
+        action_before: [0.0; MAX_ACTION],
         observations,
         rewards: vec![0.0; STEPS],
         reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
@@ -111,7 +118,14 @@ fn fly(side: f32) -> CommittedEpisode {
 
 #[test]
 fn the_mirror_image_of_an_episode_is_the_episode_through_the_mirrored_course() {
-    let (mirrored, flown) = (fly(1.0).mirrored(), fly(-1.0));
+    for space in ActionSpace::ALL {
+        assert_mirrored(space);
+    }
+}
+
+/// Compares the mirror image of an episode with the episode through the mirrored course.
+fn assert_mirrored(space: ActionSpace) {
+    let (mirrored, flown) = (fly(1.0, space).mirrored(space), fly(-1.0, space));
     assert_eq!(mirrored.actions, flown.actions);
     for (one, other) in mirrored.teacher_actions.iter().zip(&flown.teacher_actions) {
         for (one, other) in one.iter().zip(other) {
@@ -170,10 +184,10 @@ fn mirroring_swaps_left_and_right_and_nothing_else() {
             half_section_m: [3.0, 3.5],
         }
     };
-    let mut flown = fly(1.0);
+    let mut flown = fly(1.0, ActionSpace::Lateral);
     flown.observations[0].ground_truth = truth(1.0).numbers();
     assert_eq!(
-        flown.mirrored().observations[0].ground_truth,
+        flown.mirrored(ActionSpace::Lateral).observations[0].ground_truth,
         truth(-1.0).numbers()
     );
 }

@@ -43,6 +43,7 @@ fn the_shipped_configurations_exist() {
             "local.toml",
             "one-course.toml",
             "paper.toml",
+            "slalom.toml",
             "smoke.toml"
         ]
     );
@@ -63,7 +64,7 @@ fn every_shipped_configuration_can_be_flown_unchanged() {
         {
             let course = Arc::new(Course::load(path).unwrap());
             assert!(
-                course.walls().len() >= usize::from(config.learning.levels),
+                course.levels() >= config.learning.levels,
                 "{}: more start levels than {} has walls",
                 file.display(),
                 path.display()
@@ -106,7 +107,8 @@ fn every_shipped_suite_can_be_flown_and_one_has_an_entry_per_family_of_shapes() 
         |name: &str| Suite::load(repository().join("configs/evaluations").join(name)).unwrap();
     let [generalist, shapes, untried] =
         ["generalist.toml", "shapes.toml", "untried.toml"].map(suite);
-    let all = [&generalist, &shapes, &untried, &suite("paper.toml")];
+    let [paper, slalom, worlds] = ["paper.toml", "slalom.toml", "worlds.toml"].map(suite);
+    let all = [&generalist, &shapes, &untried, &paper, &slalom, &worlds];
     for entry in all.into_iter().flat_map(|suite| &suite.entries) {
         entry.courses.of_episode(0).unwrap();
     }

@@ -85,7 +85,7 @@ impl Run {
         let mut dispatcher = Dispatcher::new(
             self.identity.run,
             &self.config.transport,
-            self.config.vae.latent,
+            self.config.record_lengths(),
         );
         dispatcher.order(EpisodeOrder {
             ticket: self.ticket(0),

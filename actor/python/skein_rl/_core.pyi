@@ -10,6 +10,7 @@ __version__: str
 
 class Task:
     course_names: list[str]
+    action_names: list[str]
     latent: int
     settings: dict[str, Any]
     def __init__(
@@ -45,6 +46,7 @@ class Policy:
     sha256: str
     latent: int
     observation: str
+    action_names: list[str]
     history_steps: list[int]
     def __init__(self, path: str | PathLike[str], threads: int) -> None: ...
     def reset(self, seeds: Sequence[int]) -> None: ...

@@ -27,7 +27,8 @@ class Actor:
     The run's policy flies it, with exploration, for each ticket that the learner issues; the
     learner takes the episodes like any other actor's. Needs ``pip install skein-rl[actor]``.
 
-    The environment has two actions in [-1, 1] and these parts of a ``Dict`` observation:
+    The environment has an action of as many numbers as the run's ``simulator.vehicle.action``, in
+    [-1, 1], and these parts of a ``Dict`` observation:
 
     ============  ====================  =========================================================
     ``depth``     uint8 [1, 72, 128]    planar depth, top row first; 255 is the range of the
@@ -119,6 +120,11 @@ class Actor:
 
     def step(self, action: list[float]) -> tuple[Any, ...]:
         """Flies a step; returns the moment after it for the transport."""
+        if self._env.action_space.shape != (len(action),):
+            raise ValueError(
+                f"action_space has the shape {self._env.action_space.shape}, but actions of this "
+                f"run have {len(action)} numbers: simulator.vehicle.action"
+            )
         returned = self._env.step(np.array(action, dtype=np.float32))
         if not isinstance(returned, tuple) or len(returned) != 5:
             raise ValueError(
@@ -128,7 +134,7 @@ class Actor:
         ended = _outcome(bool(terminated), bool(truncated), info)
         return _moment("env.step()", observation, info, reward, ended)
 
-    def oracle(self) -> list[float]:
+    def oracle(self, numbers: int) -> list[float]:
         """The action of the environment's oracle, for runs that learn from one."""
         oracle = getattr(self._env.unwrapped, "oracle_action", None)
         if oracle is None:
@@ -136,7 +142,7 @@ class Actor:
                 "the environment has no oracle_action(), but [teacher] policy = \"oracle\" of this "
                 "run needs it: give the run a trained policy as its teacher"
             )
-        return _numbers("env.oracle_action()", "action", oracle(), 2)
+        return _numbers("env.oracle_action()", "action", oracle(), numbers)
 
 
 def _check_spaces(env: gymnasium.Env[Any, Any]) -> None:
@@ -153,10 +159,11 @@ def _check_spaces(env: gymnasium.Env[Any, Any]) -> None:
             raise ValueError(f"observation_space[{name!r}] has the shape {found}, not {shape}")
     if spaces["depth"].dtype != np.uint8:
         raise ValueError(f"observation_space[\"depth\"] has {spaces['depth'].dtype}, not uint8")
-    if env.action_space.shape != (2,):
+    shape = env.action_space.shape
+    if shape is None or len(shape) != 1 or not 2 <= shape[0] <= 4:
         raise ValueError(
-            f"action_space has the shape {env.action_space.shape}, not (2,): velocity to command "
-            "left and up, in [-1, 1]"
+            f"action_space has the shape {shape}, not (2,), (3,) or (4,): the numbers of the run's "
+            "simulator.vehicle.action, in [-1, 1]"
         )
 
 

@@ -26,7 +26,7 @@ _KINDS: dict[str, tuple[Any, int]] = {
     "hit_wall": (np.int64, 0),
     "outcome": (np.int64, 0),
     "velocity": (np.float32, 3),
-    "previous_action": (np.float32, 2),
+    "previous_action": (np.float32, 4),
     "reward_terms": (np.float32, len(_core.REWARD_TERMS)),
     "position_m": (np.float32, 3),
     "orientation": (np.float32, 4),
@@ -39,8 +39,9 @@ if list(_KINDS) != _core.COLUMNS:
     raise ImportError("skein_rl and its compiled part are of different versions: install again")
 
 
-def arrays(block: bytearray, n: int, latent: int) -> Batch:
+def arrays(block: bytearray, n: int, task: _core.Task) -> Batch:
     """Arrays ``[n, …]`` by name; they share the block's memory, which nobody else has."""
+    latent, numbers = task.latent, len(task.action_names)
     depth = np.frombuffer(block, np.uint8, n * _PIXELS)
     batch: Batch = {"depth": depth.reshape(n, 1, *IMAGE)}
     place = n * _PIXELS
@@ -48,6 +49,7 @@ def arrays(block: bytearray, n: int, latent: int) -> Batch:
         column = np.frombuffer(block, kind, n * max(width, 1), place)
         place += column.nbytes
         batch[name] = column.reshape(n, width) if width else column
+    batch["previous_action"] = batch["previous_action"][:, :numbers]
     if latent:
         batch["latent"] = batch["latent"][:, :latent]
     else:

@@ -28,11 +28,13 @@ class Recording:
         columns: arrays ``[rows, …]`` by name; ``docs/python.md`` lists them.
         course_names: names that ``columns["course"]`` indexes.
         reward_term_names: names of the columns of ``reward_terms``.
+        action_names: names of the columns of ``action`` and ``oracle_action``.
     """
 
     columns: Columns = field(repr=False)
     course_names: list[str]
     reward_term_names: list[str]
+    action_names: list[str]
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self.columns[name]
@@ -118,11 +120,13 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         raise ValueError(f"{path} is no recording: it has no array {', '.join(missing)}")
     names = [str(name) for name in columns.pop("course_names")]
     terms = [str(name) for name in columns.pop("reward_term_names", _core.REWARD_TERMS)]
+    # Recordings without names are of a drone that chose left and up alone.
+    axes = [str(name) for name in columns.pop("action_names", ("left", "up"))]
     rows = len(columns["step"])
     for name, column in columns.items():
         if column.shape[:1] != (rows,):
             raise ValueError(f"{path} is damaged: {name} has {column.shape} for {rows} rows")
-    return Recording(columns, names, terms)
+    return Recording(columns, names, terms, axes)
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
@@ -167,15 +171,16 @@ def to_minari(
         from minari.data_collector import EpisodeBuffer
     except ImportError:
         raise ImportError('to_minari needs Minari: pip install "skein-rl[minari]"') from None
-    from . import task
     from .env import CorridorEnv
 
     parts = ("depth", "velocity", "previous_action")
-    env = CorridorEnv(observation=parts)
+    spaces = {("left", "up"): "lateral", ("forward", "left", "up"): "velocity"}
+    action = spaces.get(tuple(recording.action_names), "velocity+yaw")
+    env = CorridorEnv(observation=parts, vehicle={"action": action})
     buffers = [
         EpisodeBuffer(
             id=number,
-            observations={name: list(column) for name, column in observations(episode).items()},
+            observations={name: list(column) for name, column in observations(episode, action).items()},
             actions=list(episode["action"][:-1]),
             rewards=[float(reward) for reward in episode["reward"][:-1]],
             terminations=[bool(end) for end in episode["terminated"][:-1]],
@@ -188,20 +193,34 @@ def to_minari(
         dataset_id=dataset_id,
         buffer=buffers,
         observation_space=env.observation_space,
-        action_space=task.action_space(),
+        action_space=env.action_space,
         **keywords,
     )
 
 
-def observations(episode: Mapping[str, npt.NDArray[Any]]) -> Columns:
+def observations(episode: Mapping[str, npt.NDArray[Any]], action: str = "lateral") -> Columns:
     """Observations of an episode, ``[steps + 1, …]``, as the environment gives them."""
+    turns = action == "velocity+yaw"
+    world = episode["velocity_mps"]
     previous = np.zeros_like(episode["action"])
     previous[1:] = episode["action"][:-1]
     return {
         "depth": episode["depth"][:, None],
-        "velocity": episode["velocity_mps"],
+        "velocity": _in_heading_frame(world, episode["orientation"]) if turns else world,
         "previous_action": previous,
     }
+
+
+def _in_heading_frame(
+    vectors: npt.NDArray[Any], orientations: npt.NDArray[Any]
+) -> npt.NDArray[np.float32]:
+    """Vectors of the world ``[n, 3]``, as a drone sees them: where its nose points, left, up."""
+    i, j, k, w = orientations.T
+    along, beside = 1 - 2 * (j * j + k * k), 2 * (i * j + w * k)
+    level = np.hypot(along, beside)
+    cos, sin = along / level, beside / level
+    x, y, z = vectors.T
+    return np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=1).astype(np.float32)
 
 
 def _pandas() -> Any:

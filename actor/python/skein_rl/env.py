@@ -22,8 +22,11 @@ Action = npt.NDArray[np.float32]
 class CorridorEnv(gymnasium.Env[Observation, Action]):
     """A quadrotor that flies through a corridor of walls with openings, by its depth camera.
 
-    It flies forward on its own. An action is the velocity to command left and up, float32 ``[2]``,
-    m/s in [-1, 1], for one control period (0.5 s).
+    An action is float32 in [-1, 1], for one control period (0.5 s). By default it is ``[2]``: the
+    velocity to command left and up, m/s; the drone flies forward on its own. With
+    ``vehicle={"action": "velocity"}`` it is ``[3]``: forward (1 is ``max_speed_mps``, 0 hovers, -1
+    flies back at 1 m/s), left and up; ``"velocity+yaw"`` adds the turning rate to the left, rad/s.
+    :attr:`action_names` has the order.
 
     An observation is a dictionary of fresh arrays:
 
@@ -31,8 +34,8 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
     ``depth``           uint8 [1, 72, 128]   planar depth, top row first; 255 is the camera's
                                              range (20 m) or farther, 0 is no reading
     ``latent``          float32 [latent]     the encoder's code of that image
-    ``velocity``        float32 [3]          forward, left, up, m/s, world frame
-    ``previous_action`` float32 [2]          zeros after a reset
+    ``velocity``        float32 [3]          forward, left, up, m/s, heading frame
+    ``previous_action`` float32 [action]     zeros after a reset
     ``ground_truth``    float32 [18]         what the camera does not show
     ==================  ===================  ==================================================
 
@@ -65,7 +68,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         self._task = task.build(keywords)
         self._parts = task.observed(observation, self._task)
         self.observation_space = task.observation_space(self._parts, self._task)  # type: ignore[assignment]
-        self.action_space = task.action_space()  # type: ignore[assignment]
+        self.action_space = task.action_space(self._task)  # type: ignore[assignment]
         self._fleet: Optional[_core.Fleet] = _core.Fleet(self._task, 1, 1, "Disabled")
         self._seeded = False
         self._window: Optional[render.Window] = None
@@ -74,6 +77,11 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
     def settings(self) -> dict[str, Any]:
         """All settings of the simulator, defaults included."""
         return self._task.settings
+
+    @property
+    def action_names(self) -> list[str]:
+        """Names of the numbers of an action, in order."""
+        return self._task.action_names
 
     @property
     def course_names(self) -> list[str]:
@@ -113,7 +121,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         """
         fleet = self._open()
         try:
-            stepped, _ = fleet.step(actions_of(action, (2,)))
+            stepped, _ = fleet.step(actions_of(action, (len(self.action_names),)))
         except RuntimeError as error:
             raise ResetNeeded(str(error)) from None
         self._show()
@@ -127,7 +135,8 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         )
 
     def oracle_action(self) -> Action:
-        """The action of an oracle that knows the course, float32 ``[2]``: for teachers and tests."""
+        """The action of an oracle that knows the course, float32 ``[action]``: for teachers and
+        tests."""
         try:
             return np.array(self._open().oracle_actions()[0], dtype=np.float32)
         except RuntimeError as error:
@@ -172,7 +181,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         return self._fleet
 
     def _batch(self, block: bytearray) -> Batch:
-        return arrays(block, 1, self._task.latent)
+        return arrays(block, 1, self._task)
 
     def _observation(self, batch: Batch) -> Observation:
         return {part: batch[part][0] for part in self._parts}

@@ -83,6 +83,11 @@ class Policy:
         return self._core.observation
 
     @property
+    def action_names(self) -> list[str]:
+        """Names of the numbers of an action, in order."""
+        return self._core.action_names
+
+    @property
     def history_steps(self) -> list[int]:
         """Numbers of steps back of the earlier steps that it also sees."""
         return self._core.history_steps
@@ -116,7 +121,7 @@ class Policy:
             deterministic: False draws from the policy, as in training.
 
         Returns:
-            float32 ``[2]``, or ``[n, 2]`` for a batch.
+            float32 ``[action]``, or ``[n, action]`` for a batch.
 
         Raises:
             KeyError: a part of the observation is missing.
@@ -148,7 +153,7 @@ class Policy:
             "mode" if deterministic else "sample",
         )
         actions: npt.NDArray[np.float32] = np.frombuffer(block, np.float32).copy()
-        return actions if single else actions.reshape(rows, 2)
+        return actions if single else actions.reshape(rows, len(self.action_names))
 
     def encode(self, depth: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
         """Latent codes, float32 ``[n, latent]``, of depth images, uint8 ``[n, …, 72, 128]``."""

@@ -108,15 +108,15 @@ def observation_space(parts: Sequence[str], task: _core.Task) -> spaces.Dict:
         "depth": spaces.Box(0, 255, (1, 72, 128), np.uint8),
         "latent": spaces.Box(-code, code, (max(task.latent, 1),), np.float32),
         "velocity": spaces.Box(-mps, mps, (3,), np.float32),
-        "previous_action": spaces.Box(-1.0, 1.0, (2,), np.float32),
+        "previous_action": action_space(task),
         "ground_truth": spaces.Box(-1e4, 1e4, (_GROUND_TRUTH,), np.float32),
     }
     return spaces.Dict({part: every[part] for part in parts})
 
 
-def action_space() -> spaces.Box:
-    """Velocity to command left and up, m/s."""
-    return spaces.Box(-1.0, 1.0, (2,), np.float32)
+def action_space(task: _core.Task) -> spaces.Box:
+    """The numbers of ``vehicle.action``: ``task.action_names``."""
+    return spaces.Box(-1.0, 1.0, (len(task.action_names),), np.float32)
 
 
 def seed_of(seed: Any) -> int:

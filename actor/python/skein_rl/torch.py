@@ -31,13 +31,17 @@ class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
         self.policy = nn.ModuleDict(
             {f"layer{n}": _linear(weights, f"policy.layer{n}") for n in range(1, 5)}
         )
-        extra = {"latent": 0, "latent+velocity": 2, "latent+velocity+action": 4}
+        self.action = len(policy.action_names)
+        # A drone that flies forward at a constant speed sees its velocity left and up alone.
+        self.velocity = 3 if "forward" in policy.action_names else 2
+        extra = {"latent": 0, "latent+velocity": self.velocity}
+        extra["latent+velocity+action"] = self.velocity + self.action
         self.step_len = policy.latent + extra[self.sees]
 
     def start(self, n: int = 1) -> torch.Tensor:
         """History of ``n`` episodes that begin."""
         rows = max(self.history_steps, default=1)
-        return torch.zeros(n, rows, self.step_len + 3)
+        return torch.zeros(n, rows, self.step_len + self.action + 1)
 
     def encode(self, depth: torch.Tensor) -> torch.Tensor:
         """Latent codes ``[n, latent]`` of images, uint8 ``[n, 1, 72, 128]``."""
@@ -48,7 +52,7 @@ class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
         return code
 
     def distribution(self, observed: torch.Tensor) -> torch.Tensor:
-        """The last layer's outputs: means before tanh ``[n, 2]`` and, of SAC, log deviations."""
+        """The last layer's outputs: means before tanh ``[n, action]`` and, of SAC, log deviations."""
         for n in range(1, 4):
             observed = torch.relu(self.policy[f"layer{n}"](observed))
         outputs: torch.Tensor = self.policy["layer4"](observed)
@@ -57,14 +61,15 @@ class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
     def forward(
         self, depth: torch.Tensor, velocity: torch.Tensor, history: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Actions ``[n, 2]`` and the next history."""
+        """Actions ``[n, action]`` and the next history."""
         newest = history[:, 0]
         starts = newest[:, -1:] < 0.5
-        parts = [self.encode(depth), velocity[:, 1:], newest[:, self.step_len : self.step_len + 2]]
+        previous = newest[:, self.step_len : self.step_len + self.action]
+        parts = [self.encode(depth), velocity[:, 3 - self.velocity :], previous]
         present = torch.cat(parts[: 1 + self.sees.count("+")], dim=1)
         past = torch.where(starts[:, None], present[:, None], history[:, :, : self.step_len])
         moments = [present] + [past[:, back - 1] for back in self.history_steps]
-        action = torch.tanh(self.distribution(torch.cat(moments, dim=1))[:, :2])
+        action = torch.tanh(self.distribution(torch.cat(moments, dim=1))[:, : self.action])
         row = torch.cat([present, action, torch.ones_like(action[:, :1])], dim=1)[:, None]
         known = torch.where(starts[:, None], row, history)
         return action, torch.cat([row, known[:, :-1]], dim=1)

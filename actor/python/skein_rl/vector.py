@@ -58,7 +58,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         self._task = task.build(keywords)
         self._parts = task.observed(observation, self._task)
         self.single_observation_space = task.observation_space(self._parts, self._task)
-        self.single_action_space = task.action_space()
+        self.single_action_space = task.action_space(self._task)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._fleet: Optional[_core.Fleet] = self._new_fleet()
@@ -68,6 +68,11 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
     def settings(self) -> dict[str, Any]:
         """All settings of the simulator, defaults included."""
         return self._task.settings
+
+    @property
+    def action_names(self) -> list[str]:
+        """Names of the numbers of an action, in order."""
+        return self._task.action_names
 
     @property
     def course_names(self) -> list[str]:
@@ -99,7 +104,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         except RuntimeError as error:
             raise ResetNeeded(f"{error} without a reset_mask") from None
         self._seeded |= mask
-        batch = arrays(block, self.num_envs, self._task.latent)
+        batch = arrays(block, self.num_envs, self._task)
         return self._observation(batch), _infos(batch, mask)
 
     def step(
@@ -110,7 +115,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         """Flies one control period in every environment.
 
         Args:
-            actions: float32 ``[num_envs, 2]``.
+            actions: float32 ``[num_envs, action]``.
 
         Raises:
             ValueError: shape or type is wrong, or a number is not finite; nothing was flown.
@@ -118,10 +123,10 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         """
         fleet = self._open()
         try:
-            block, lasts = fleet.step(actions_of(actions, (self.num_envs, 2)))
+            block, lasts = fleet.step(actions_of(actions, (self.num_envs, len(self.action_names))))
         except RuntimeError as error:
             raise ResetNeeded(str(error)) from None
-        batch = arrays(block, self.num_envs, self._task.latent)
+        batch = arrays(block, self.num_envs, self._task)
         infos = _infos(batch, np.ones(self.num_envs, dtype=np.bool_))
         if lasts:
             self._add_lasts(infos, lasts)
@@ -134,7 +139,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         )
 
     def oracle_actions(self) -> npt.NDArray[np.float32]:
-        """Actions of an oracle that knows the courses, float32 ``[num_envs, 2]``."""
+        """Actions of an oracle that knows the courses, float32 ``[num_envs, action]``."""
         try:
             return np.array(self._open().oracle_actions(), dtype=np.float32)
         except RuntimeError as error:
@@ -191,7 +196,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         final: dict[str, Any] = {}
         for index, block in lasts:
             mask[index] = True
-            batch = arrays(block, 1, self._task.latent)
+            batch = arrays(block, 1, self._task)
             final_obs[index] = {part: batch[part][0] for part in self._parts}
             for key, value in _values(batch).items():
                 if key not in final:

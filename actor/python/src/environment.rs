@@ -4,7 +4,9 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use skein_inference::EncoderScratch;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::ticket::{CourseChoice, Ticket};
-use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode, MAX_LATENT, REWARD_TERMS};
+use skein_protocol::{
+    Action, ActionSpace, IMAGE_PIXELS, LatentCode, MAX_ACTION, MAX_LATENT, REWARD_TERMS,
+};
 use skein_rollout::courses::Simulators;
 use skein_rollout::environment_loop::{EpisodeFault, reset};
 use skein_simulator::camera::DepthCamera;
@@ -45,7 +47,7 @@ pub(crate) struct EpisodeSeeds {
 pub(crate) struct Flight {
     pub(crate) ticket: Ticket,
     /// Actions since the reset.
-    pub(crate) flown: Vec<[f32; ACTION]>,
+    pub(crate) flown: Vec<Action>,
     pub(crate) ended: bool,
 }
 
@@ -71,10 +73,10 @@ impl From<SimulationError> for EnvironmentError {
 pub(crate) struct Moment {
     /// Latent code; zero without an encoder.
     pub(crate) latent: LatentCode,
-    /// Forward, left, up, m/s.
+    /// Forward, left, up, m/s; in the heading frame.
     pub(crate) velocity_mps: [f32; 3],
     /// Zero after a reset.
-    pub(crate) previous_action: [f32; ACTION],
+    pub(crate) previous_action: Action,
     pub(crate) reward: f32,
     pub(crate) reward_terms: [f32; REWARD_TERMS],
     pub(crate) terminated: bool,
@@ -183,7 +185,7 @@ impl Environment {
         let flight = flight.as_ref().ok_or(EnvironmentError::NotFlying)?;
         let simulator = simulators.of(&flight.ticket).map_err(EpisodeFault::from)?;
         simulator.render(image);
-        let mut moment = Moment::of(simulator, flight);
+        let mut moment = Moment::of(simulator, flight, task.action());
         if let Some((encoder, _)) = &task.encoder {
             let code = encoder.encode(image, scratch);
             moment.latent = code.map(|number| number.clamp(-MOST_LATENT, MOST_LATENT));
@@ -195,7 +197,7 @@ impl Environment {
     pub(crate) fn step(
         &mut self,
         task: &Flown,
-        action: [f32; ACTION],
+        action: Action,
         image: &mut [u8; IMAGE_PIXELS],
     ) -> Result<Moment, EnvironmentError> {
         let report = self.advance(action)?;
@@ -207,7 +209,7 @@ impl Environment {
         Ok(moment)
     }
 
-    fn advance(&mut self, action: [f32; ACTION]) -> Result<StepReport, EnvironmentError> {
+    fn advance(&mut self, action: Action) -> Result<StepReport, EnvironmentError> {
         self.check_flying()?;
         let flight = self.flight.as_mut().ok_or(EnvironmentError::NotFlying)?;
         let simulator = self
@@ -227,7 +229,7 @@ impl Environment {
     }
 
     /// Returns the oracle's action for the present moment.
-    pub(crate) fn oracle_action(&mut self) -> Result<[f32; ACTION], EnvironmentError> {
+    pub(crate) fn oracle_action(&mut self) -> Result<Action, EnvironmentError> {
         Ok(self.simulator()?.oracle_action())
     }
 
@@ -270,7 +272,7 @@ impl Moment {
     pub(crate) const EMPTY: Self = Self {
         latent: [0.0; MAX_LATENT],
         velocity_mps: [0.0; 3],
-        previous_action: [0.0; ACTION],
+        previous_action: [0.0; MAX_ACTION],
         reward: 0.0,
         reward_terms: [0.0; REWARD_TERMS],
         terminated: false,
@@ -288,9 +290,14 @@ impl Moment {
         ground_truth: [0.0; GroundTruth::NUMBERS],
     };
 
-    fn of(simulator: &Simulator, flight: &Flight) -> Self {
+    fn of(simulator: &Simulator, flight: &Flight, action: ActionSpace) -> Self {
         let state = simulator.state();
-        let velocity: [f32; 3] = state.velocity_mps.into();
+        let velocity: [f32; 3] = match action {
+            // The nose keeps pointing along the corridor.
+            ActionSpace::Lateral | ActionSpace::Velocity => state.velocity_mps,
+            ActionSpace::VelocityYaw => state.heading_velocity_mps(),
+        }
+        .into();
         let (course, course_seed) = match flight.ticket.course {
             CourseChoice::Generated(seed) => (-1, seed),
             CourseChoice::Evaluation(index) => (index as i32, 0),

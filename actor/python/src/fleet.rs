@@ -6,7 +6,7 @@ use pyo3::exceptions::{PyIndexError, PyRuntimeError};
 use pyo3::prelude::*;
 use pyo3::types::PyByteArray;
 use skein_protocol::ticket::CourseChoice;
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::{Action, ActionSpace, IMAGE_PIXELS, MAX_ACTION};
 
 use crate::batch::batch;
 use crate::environment::{Environment, EnvironmentError, EpisodeSeeds, Flight, Moment};
@@ -59,7 +59,7 @@ enum Failure {
 type State = (u64, u64, Option<FlightState>);
 
 /// Number, seed, course (index or -1, seed), level and actions.
-type FlightState = (u64, u64, i64, u64, u8, Vec<[f32; ACTION]>);
+type FlightState = (u64, u64, i64, u64, u8, Vec<Action>);
 
 /// A batch, and the ends of episodes that a step also reset, by environment.
 type Drawn<'py> = (Bound<'py, PyByteArray>, Vec<(usize, Last)>);
@@ -118,7 +118,7 @@ impl Fleet {
         Ok(reset)
     }
 
-    /// Flies one control period. `actions`: the bytes of f32 `[n, 2]`.
+    /// Flies one control period. `actions`: the bytes of f32 `[n, action]`.
     fn step<'py>(&mut self, py: Python<'py>, actions: &[u8]) -> PyResult<Stepped<'py>> {
         let actions = self.checked(actions)?;
         for (index, environment) in self.environments.iter().enumerate() {
@@ -146,12 +146,14 @@ impl Fleet {
         ))
     }
 
-    /// The oracle's actions, a pair for each environment.
-    fn oracle_actions(&mut self) -> PyResult<Vec<[f32; ACTION]>> {
+    /// The oracle's actions, `[n, action]`.
+    fn oracle_actions(&mut self) -> PyResult<Vec<Vec<f32>>> {
+        let numbers = self.task.action().numbers();
         let mut actions = Vec::new();
         for index in 0..self.environments.len() {
             let action = self.environments[index].oracle_action();
-            actions.push(action.map_err(|error| self.failure(index, &error))?);
+            let action = action.map_err(|error| self.failure(index, &error))?;
+            actions.push(action[..numbers].to_vec());
         }
         Ok(actions)
     }
@@ -242,17 +244,19 @@ impl Fleet {
     ///
     /// # Errors
     /// `ValueError` names the environment and the number at fault.
-    fn checked(&self, actions: &[u8]) -> PyResult<Vec<[f32; ACTION]>> {
-        let actions: Vec<[f32; ACTION]> = rows_of("actions", actions, self.environments.len())?;
+    fn checked(&self, actions: &[u8]) -> PyResult<Vec<Action>> {
+        let space = self.task.action();
+        let actions = actions_of("actions", actions, self.environments.len(), space)?;
         for (index, action) in actions.iter().enumerate() {
             if !action.iter().all(|number| number.is_finite()) {
                 return Err(refused(format!(
-                    "the action of environment {index} is {action:?}: both numbers must be \
-                     finite, within [-1, 1]"
+                    "the action of environment {index} is {:?}: all numbers must be finite, \
+                     within [-1, 1]",
+                    &action[..space.numbers()]
                 )));
             }
         }
-        let clamped = |action: [f32; ACTION]| action.map(|number| number.clamp(-1.0, 1.0));
+        let clamped = |action: Action| action.map(|number| number.clamp(-1.0, 1.0));
         Ok(actions.into_iter().map(clamped).collect())
     }
 
@@ -294,6 +298,26 @@ impl From<EnvironmentError> for Failure {
     }
 }
 
+/// Reads rows of f32 numbers, an action each.
+///
+/// # Errors
+/// `ValueError` names `what`, its length and the number of rows.
+pub(crate) fn actions_of(
+    what: &str,
+    bytes: &[u8],
+    rows: usize,
+    action: ActionSpace,
+) -> PyResult<Vec<Action>> {
+    let numbers = action.numbers();
+    let flat = rows_of::<1>(what, bytes, rows * numbers)?;
+    let padded = |row: &[[f32; 1]]| {
+        let mut action = [0.0; MAX_ACTION];
+        action[..numbers].copy_from_slice(row.as_flattened());
+        action
+    };
+    Ok(flat.chunks_exact(numbers).map(padded).collect())
+}
+
 /// Reads rows of `N` f32 numbers.
 ///
 /// # Errors
@@ -323,7 +347,7 @@ fn advance(
     task: &Flown,
     environment: &mut Environment,
     autoreset: Autoreset,
-    action: [f32; ACTION],
+    action: Action,
     image: &mut [u8; IMAGE_PIXELS],
 ) -> Result<Done, Failure> {
     if autoreset == Autoreset::NextStep && environment.has_ended() {

@@ -8,10 +8,10 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::ticket::{Exploration, Ticket};
-use skein_protocol::transition::TransitionRecord;
+use skein_protocol::transition::{RecordLengths, TransitionRecord};
+use skein_protocol::{IMAGE_PIXELS, MAX_ACTION};
 use skein_rollout::agent::Agent;
 use skein_rollout::courses::Simulators;
 use skein_rollout::environment_loop::{Directive, EnvironmentLoop, RecordLink, reset};
@@ -37,6 +37,16 @@ pub(crate) fn fly<'py>(
     course_seed: Option<u64>,
     level: Option<u8>,
 ) -> PyResult<Bound<'py, PyDict>> {
+    let (flown, trained) = (task.flown.action(), policy.config.action_space());
+    if flown != trained {
+        return Err(refused(format!(
+            "vehicle.action = \"{}\", but the policy was trained with \"{}\": give the environment \
+             vehicle={{\"action\": \"{}\"}}",
+            flown.name(),
+            trained.name(),
+            trained.name()
+        )));
+    }
     let choice = task.flown.choice(course.as_ref(), course_seed, level)?;
     let mut ticket = task.flown.ticket(seed, 0, &choice)?;
     ticket.exploration = exploration_of(exploration)?;
@@ -48,7 +58,7 @@ pub(crate) fn fly<'py>(
         flown.fly(&ticket, &policy.network, &mut memory)
     })
     .map_err(refused)?;
-    columns(py, &memory.sent, policy.config.vae.latent)
+    columns(py, &memory.sent, policy.config.record_lengths())
 }
 
 /// Flies `steps` steps with each of `environments` simulators on `threads` threads, with random
@@ -108,7 +118,8 @@ impl Alone {
             simulator.render(image);
         }
         let simulator = self.simulators.of(&self.ticket).map_err(refused)?;
-        let action = std::array::from_fn(|_| self.rng.random_range(-1.0..=1.0));
+        let mut action = [0.0; MAX_ACTION];
+        action[..flown.action().numbers()].fill_with(|| self.rng.random_range(-1.0..=1.0));
         let report = simulator.step(action).map_err(refused)?;
         simulator.render(image);
         let settings = &flown.courses.settings().reward;
@@ -161,7 +172,7 @@ impl RecordLink for Memory {
 fn columns<'py>(
     py: Python<'py>,
     sent: &[Box<TransitionRecord>],
-    latent: usize,
+    lengths: RecordLengths,
 ) -> PyResult<Bound<'py, PyDict>> {
     let images: Vec<u8> = sent.iter().flat_map(|record| record.depth).collect();
     let bytes = |of: fn(&TransitionRecord) -> u8| -> Bound<'py, PyBytes> {
@@ -174,11 +185,15 @@ fn columns<'py>(
     };
     let dict = PyDict::new(py);
     dict.set_item("depth", PyBytes::new(py, &images))?;
-    dict.set_item("latent", numbers(&|record| &record.latent[..latent]))?;
+    dict.set_item(
+        "latent",
+        numbers(&|record| &record.latent[..lengths.latent]),
+    )?;
     dict.set_item("position_m", numbers(&|record| &record.position_m))?;
     dict.set_item("orientation", numbers(&|record| &record.orientation))?;
     dict.set_item("velocity_mps", numbers(&|record| &record.velocity_mps))?;
-    dict.set_item("action", numbers(&|record| &record.action))?;
+    let action = lengths.action.numbers();
+    dict.set_item("action", numbers(&|record| &record.action[..action]))?;
     dict.set_item("reward_terms", numbers(&|record| &record.reward_terms))?;
     dict.set_item(
         "reward",

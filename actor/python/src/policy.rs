@@ -14,10 +14,10 @@ use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
-use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode, MAX_LATENT};
+use skein_protocol::{Action, IMAGE_PIXELS, LatentCode, MAX_ACTION, MAX_LATENT};
 use skein_rollout::agent::Agent;
 
-use crate::fleet::rows_of;
+use crate::fleet::{actions_of, rows_of};
 use crate::flight::exploration_of;
 use crate::parallel::for_each;
 use crate::task::refused;
@@ -39,7 +39,7 @@ struct Row {
     /// Step, latent code and velocity, as an actor's agent reads them.
     record: Box<TransitionRecord>,
     next_step: u32,
-    last_action: [f32; ACTION],
+    last_action: Action,
     noise: Pcg64Mcg,
     scratch: Scratch,
 }
@@ -66,7 +66,7 @@ impl Policy {
             agent: Agent::new(layout.clone()),
             record: Box::new(TransitionRecord::zeroed()),
             next_step: 0,
-            last_action: [0.0; ACTION],
+            last_action: [0.0; MAX_ACTION],
             noise: Pcg64Mcg::seed_from_u64(derive(seed, Purpose::ActionNoise, 0)),
             scratch: Scratch::default(),
         };
@@ -79,8 +79,8 @@ impl Policy {
         self.rows.len()
     }
 
-    /// Actions, f32 `[n, 2]`. Bytes of `images`: u8 `[n, 9216]`, or of `latents`: f32
-    /// `[n, latent]`; of `velocities`: f32 `[n, 3]`; of `previous`: f32 `[n, 2]`, by default the
+    /// Actions, f32 `[n, action]`. Bytes of `images`: u8 `[n, 9216]`, or of `latents`: f32
+    /// `[n, latent]`; of `velocities`: f32 `[n, 3]`; of `previous`: f32 `[n, action]`, by default the
     /// actions returned before; `starts`: rows whose episode begins.
     #[allow(clippy::too_many_arguments, reason = "the columns of a batch")]
     fn act<'py>(
@@ -94,6 +94,7 @@ impl Policy {
         exploration: &str,
     ) -> PyResult<Bound<'py, PyBytes>> {
         let (count, latent) = (self.rows.len(), self.config.vae.latent);
+        let action = self.config.action_space();
         let seen = Seen {
             images: images.map(|bytes| images_of(bytes, count)).transpose()?,
             latents: latents
@@ -102,7 +103,7 @@ impl Policy {
             latent,
             velocities: rows_of("velocity", velocities, count)?,
             previous: previous
-                .map(|bytes| rows_of("previous_action", bytes, count))
+                .map(|bytes| actions_of("previous_action", bytes, count, action))
                 .transpose()?,
         };
         seen.check()?;
@@ -128,7 +129,9 @@ impl Policy {
                 row.act(network, &seen, index, exploration);
             });
         });
-        let actions: Vec<_> = self.rows.iter().map(|row| row.last_action).collect();
+        let taken = self.rows.iter();
+        let actions = taken.flat_map(|row| &row.last_action[..action.numbers()]);
+        let actions: Vec<f32> = actions.copied().collect();
         Ok(PyBytes::new(py, bytemuck::cast_slice(&actions)))
     }
 
@@ -195,6 +198,13 @@ impl Policy {
         }
     }
 
+    /// Names of the numbers of an action, in order.
+    #[getter]
+    fn action_names(&self) -> Vec<&'static str> {
+        let axes = self.config.action_space().axes().iter();
+        axes.map(|axis| axis.name()).collect()
+    }
+
     /// Numbers of steps back of the earlier steps that the policy sees.
     #[getter]
     fn history_steps(&self) -> Vec<usize> {
@@ -214,7 +224,7 @@ struct Seen<'a> {
     latents: Option<Vec<[f32; 1]>>,
     latent: usize,
     velocities: Vec<[f32; 3]>,
-    previous: Option<Vec<[f32; ACTION]>>,
+    previous: Option<Vec<Action>>,
 }
 
 impl Seen<'_> {
@@ -247,7 +257,7 @@ impl Seen<'_> {
 impl Row {
     /// Begins another episode.
     fn restart(&mut self) {
-        (self.next_step, self.last_action) = (0, [0.0; ACTION]);
+        (self.next_step, self.last_action) = (0, [0.0; MAX_ACTION]);
     }
 
     fn act(&mut self, network: &Network, seen: &Seen<'_>, index: usize, exploration: Exploration) {

@@ -9,6 +9,7 @@ use pyo3::types::{PyDict, PyString};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, trained_encoder};
+use skein_protocol::ActionSpace;
 use skein_protocol::config::Config;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion, RunId};
@@ -120,6 +121,13 @@ impl Task {
         self.flown.encoder.as_ref().map_or(0, |(_, latent)| *latent)
     }
 
+    /// Names of the numbers of an action, in order.
+    #[getter]
+    fn action_names(&self) -> Vec<&'static str> {
+        let axes = self.flown.action().axes().iter();
+        axes.map(|axis| axis.name()).collect()
+    }
+
     /// All settings of the simulator, defaults included.
     #[getter]
     fn settings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -129,6 +137,11 @@ impl Task {
 }
 
 impl Flown {
+    /// Returns the numbers of an action.
+    pub(crate) fn action(&self) -> ActionSpace {
+        self.courses.settings().vehicle.action
+    }
+
     fn check(&self) -> PyResult<()> {
         let settings = self.courses.settings();
         if !(0.0..=1.0).contains(&self.generated_share) {

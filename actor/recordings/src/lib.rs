@@ -18,9 +18,9 @@ use std::path::Path;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 use prost::Message;
-use skein_protocol::REWARD_TERM_NAMES;
 use skein_protocol::evaluation::EpisodeScore;
-use skein_protocol::transition::{Outcome, TransitionRecord};
+use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
+use skein_protocol::{ActionSpace, REWARD_TERM_NAMES};
 use skein_rollout::recording::RecordingRow;
 use skein_simulator::course::Course;
 use skein_simulator::simulator::SimulatorSettings;
@@ -42,8 +42,8 @@ pub struct Episode<'a> {
     pub course: (&'a Course, i32),
     /// Number of the episode on that course.
     pub number: i32,
-    /// Length of the latent codes.
-    pub latent: usize,
+    /// Lengths of the latent codes and of the actions.
+    pub lengths: RecordLengths,
     /// How it ended.
     pub score: EpisodeScore,
 }
@@ -121,13 +121,14 @@ pub struct Recording<'a> {
 }
 
 impl<'a> Recording<'a> {
-    /// Creates the file `path` of flights with `settings` through `courses`.
+    /// Creates the file `path` of flights with `settings` and `action` through `courses`.
     ///
     /// # Errors
     /// Of the file.
     pub fn create(
         path: &Path,
         settings: &'a SimulatorSettings,
+        action: ActionSpace,
         courses: &[&str],
     ) -> io::Result<Self> {
         let options = WriteOptions::new()
@@ -153,6 +154,8 @@ impl<'a> Recording<'a> {
             walls_passed: 0,
             before_m: None,
         };
+        let axes: Vec<_> = action.axes().iter().map(|axis| axis.name()).collect();
+        recording.write_names("action_names", &axes)?;
         recording.write_names("course_names", courses)?;
         recording.write_names("reward_term_names", &REWARD_TERM_NAMES)?;
         Ok(recording)
@@ -173,7 +176,7 @@ impl<'a> Recording<'a> {
             self.write_step(&RecordingRow {
                 course: number,
                 episode: episode.number,
-                latent: episode.latent,
+                lengths: episode.lengths,
                 record,
             })?;
         }

@@ -11,15 +11,15 @@ use skein_protocol::IMAGE_PIXELS;
 
 use crate::Topic;
 use crate::messages::{Log, RawImage, SceneEntity, SceneUpdate};
-use crate::scene::{CORRIDOR, WALL};
+use crate::scene::{CORRIDOR, OBSTACLES, WALL};
 use crate::schemas::decode_step;
 
 /// Most steps of a recording that are read: about 1 KB of memory each.
 pub const MOST_STEPS: usize = 20_000;
 /// Most bytes of a record: many times an image's or a course's.
 const MOST_RECORD_BYTES: usize = 8 << 20;
-/// Most points of an outline or triangle corners of a wall: far above a course's.
-const MOST_POINTS: usize = 10_000;
+/// Most points of an outline, or corners of the triangles of a wall or of all obstacles.
+const MOST_POINTS: usize = 300_000;
 const NANOS: f64 = 1e9;
 
 /// An episode of a recording, without images: [`images`].
@@ -31,6 +31,8 @@ pub struct RecordedFlight {
     pub corridor_m: [f32; 3],
     /// Walls in the order along the corridor.
     pub walls: Vec<RecordedWall>,
+    /// Triangles of the obstacles that stand still.
+    pub obstacles_m: Vec<[[f32; 3]; 3]>,
     /// Observations in order, the closing one last.
     pub steps: Vec<RecordedStep>,
     /// Events, each with the second in the episode.
@@ -184,6 +186,8 @@ fn begin(scene: SceneUpdate, begin_nanos: u64) -> RecordedFlight {
             flight.corridor_m = corridor_m(entity);
         } else if entity.id.starts_with(WALL) {
             flight.walls.push(wall(entity));
+        } else if entity.id == OBSTACLES {
+            flight.obstacles_m = triangles_m(entity);
         }
     }
     flight
@@ -208,35 +212,46 @@ fn wall(entity: &SceneEntity) -> RecordedWall {
         .take(MOST_POINTS)
         .map(|&point| point.into())
         .collect();
+    RecordedWall {
+        x_m: outline.first().map_or(0.0, |&[x_m, ..]| x_m),
+        outline_m: outline.iter().map(|&[_, y_m, z_m]| [y_m, z_m]).collect(),
+        triangles_m: triangles_m(entity),
+    }
+}
+
+fn triangles_m(entity: &SceneEntity) -> Vec<[[f32; 3]; 3]> {
     let corners = entity.triangles.iter().flat_map(|list| &list.points);
     let corners: Vec<[f32; 3]> = corners
         .take(MOST_POINTS)
         .map(|&point| point.into())
         .collect();
-    RecordedWall {
-        x_m: outline.first().map_or(0.0, |&[x_m, ..]| x_m),
-        outline_m: outline.iter().map(|&[_, y_m, z_m]| [y_m, z_m]).collect(),
-        triangles_m: corners.as_chunks::<3>().0.to_vec(),
-    }
+    corners.as_chunks::<3>().0.to_vec()
 }
 
 #[cfg(test)]
 mod tests {
     use bytemuck::Zeroable;
+    use skein_protocol::ActionSpace;
     use skein_protocol::evaluation::EpisodeScore;
-    use skein_protocol::transition::{Outcome, TransitionRecord};
+    use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
     use skein_simulator::course::Course;
     use skein_simulator::simulator::SimulatorSettings;
 
     use super::*;
     use crate::{Episode, Recording};
 
+    const LENGTHS: RecordLengths = RecordLengths {
+        latent: 8,
+        action: ActionSpace::Velocity,
+    };
+
     /// Returns a recording of two episodes of three records each.
     fn recording(course: &Course) -> Vec<u8> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("two.mcap");
         let settings = SimulatorSettings::default();
-        let mut recording = Recording::create(&path, &settings, &["a course"]).unwrap();
+        let mut recording =
+            Recording::create(&path, &settings, LENGTHS.action, &["a course"]).unwrap();
         for number in 0..2u8 {
             let records = (0..3u8).map(|step| {
                 let mut record = Box::new(TransitionRecord::zeroed());
@@ -251,7 +266,7 @@ mod tests {
                 title: &format!("episode {number}"),
                 course: (course, 0),
                 number: number.into(),
-                latent: 8,
+                lengths: LENGTHS,
                 score: EpisodeScore {
                     walls_passed: 0,
                     walls: 2,

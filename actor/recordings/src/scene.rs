@@ -1,4 +1,4 @@
-//! Scene that a viewer draws in 3-D: the corridor, its walls, the drone and its trail, the frames.
+//! Scene that a viewer draws in 3-D: the corridor, its walls, still obstacles, the drone and its trail, the frames.
 
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
@@ -12,6 +12,8 @@ use crate::messages::{
 /// Beginnings of the entities' names.
 pub(crate) const CORRIDOR: &str = "corridor";
 pub(crate) const WALL: &str = "wall";
+/// Name of the entity of all obstacles that stand still.
+pub(crate) const OBSTACLES: &str = "obstacles";
 
 /// Height of the drone's body, metres. Source: as for [`DRONE_WIDTH_M`].
 const DRONE_HEIGHT_M: f32 = 0.29;
@@ -43,6 +45,17 @@ pub(crate) fn of_course(course: &Course, title: &str, at: Timestamp) -> SceneUpd
                 EDGE,
             )],
             ..entity(WORLD, format!("{WALL} {number}"), at)
+        });
+    }
+    let obstacles = course.obstacle_triangles();
+    if !obstacles.is_empty() {
+        entities.push(SceneEntity {
+            triangles: vec![TriangleListPrimitive {
+                pose: Some(Pose::origin()),
+                points: obstacles.into_iter().flatten().map(Vector3::from).collect(),
+                color: Some(Color::rgba(WALL_COLOUR)),
+            }],
+            ..entity(WORLD, OBSTACLES.to_owned(), at)
         });
     }
     if let Some(first) = entities.first_mut() {

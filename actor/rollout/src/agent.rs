@@ -6,7 +6,7 @@ use skein_protocol::config::ObservationLayout;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
-use skein_protocol::{ACTION, LatentCode};
+use skein_protocol::{Action, LatentCode, MAX_ACTION};
 
 use crate::world::World;
 
@@ -47,7 +47,7 @@ impl Agent {
         lap(Stage::Encoder);
     }
 
-    /// Chooses an action for the observation in `record`, each command in [-1, 1]. `noise` is used
+    /// Chooses an action for the observation in `record`, each number in [-1, 1]. `noise` is used
     /// unless the policy's mode is asked for. Call it for each step of an episode, in order; step 0
     /// starts a new episode.
     pub fn act(
@@ -55,15 +55,22 @@ impl Agent {
         exploration: Exploration,
         network: &Network,
         record: &TransitionRecord,
-        previous_action: &[f32; ACTION],
+        previous_action: &Action,
         noise: &mut impl Rng,
-    ) -> [f32; ACTION] {
+    ) -> Action {
         self.remember(record, &record.latent, previous_action);
         match exploration {
-            Exploration::Uniform => std::array::from_fn(|_| noise.random_range(-1.0..=1.0)),
+            Exploration::Uniform => self.uniform(noise),
             Exploration::Sample => self.distribution(record, network).sample(noise),
             Exploration::Mode => self.distribution(record, network).mode(),
         }
+    }
+
+    /// Draws an action, each number uniformly from [-1, 1].
+    fn uniform(&self, noise: &mut impl Rng) -> Action {
+        let mut action = [0.0; MAX_ACTION];
+        action[..self.layout.action.numbers()].fill_with(|| noise.random_range(-1.0..=1.0));
+        action
     }
 
     /// Returns what another policy, with an encoder of its own, would do for the image in `record`,
@@ -72,8 +79,8 @@ impl Agent {
         &mut self,
         network: &Network,
         record: &TransitionRecord,
-        previous_action: &[f32; ACTION],
-    ) -> [f32; ACTION] {
+        previous_action: &Action,
+    ) -> Action {
         let latent = network.encode(&record.depth, &mut self.scratch);
         self.remember(record, &latent, previous_action);
         self.distribution(record, network).mode()
@@ -99,7 +106,7 @@ impl Agent {
         &mut self,
         record: &TransitionRecord,
         latent: &LatentCode,
-        previous_action: &[f32; ACTION],
+        previous_action: &Action,
     ) {
         let len = self.layout.step_len();
         let first = record.step as usize * len;
@@ -107,6 +114,7 @@ impl Agent {
         self.layout.write_step(
             latent,
             &record.velocity_mps,
+            &record.orientation,
             previous_action,
             &mut self.step_inputs[first..],
         );

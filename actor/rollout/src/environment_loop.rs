@@ -17,7 +17,7 @@ use skein_protocol::segment::Segment;
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, REWARD_TERM_NAMES};
+use skein_protocol::{Action, REWARD_TERM_NAMES};
 use skein_simulator::course::NoSuchLevel;
 use skein_simulator::reward::{RewardSettings, RewardTerms};
 use skein_simulator::simulator::{
@@ -266,11 +266,11 @@ pub enum EpisodeFault {
 struct PausedEpisode {
     ticket: Ticket,
     /// Actions from the reset on.
-    flown: Vec<[f32; ACTION]>,
+    flown: Vec<Action>,
 }
 
 impl PausedEpisode {
-    fn after(ticket: &Ticket, flown: Vec<[f32; ACTION]>) -> Self {
+    fn after(ticket: &Ticket, flown: Vec<Action>) -> Self {
         let ticket = ticket.clone();
         Self { ticket, flown }
     }
@@ -286,7 +286,7 @@ impl PausedEpisode {
                 ticket.seed,
             )
         };
-        let bits = |actions: &[[f32; ACTION]]| -> Vec<_> {
+        let bits = |actions: &[Action]| -> Vec<_> {
             actions.iter().flatten().map(|x| x.to_bits()).collect()
         };
         episode(&self.ticket) == episode(ticket)
@@ -301,7 +301,7 @@ fn position_at_start<'a, W: Worlds>(
     worlds: &'a mut W,
     paused: Option<PausedEpisode>,
     ticket: &Ticket,
-) -> Result<(&'a mut W::World, Vec<[f32; ACTION]>), EpisodeFault> {
+) -> Result<(&'a mut W::World, Vec<Action>), EpisodeFault> {
     let Some(segment) = &ticket.segment else {
         return Ok((worlds.reset(ticket)?, Vec::new()));
     };
@@ -367,7 +367,7 @@ const fn are_equal(left: &[&str], right: &[&str]) -> bool {
 /// Writes an action and its consequences into the record of its observation.
 fn complete(
     record: &mut TransitionRecord,
-    action: [f32; ACTION],
+    action: Action,
     report: &StepReport,
     reward: &RewardTerms,
 ) {

@@ -10,13 +10,13 @@ use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use skein_protocol::files::destination;
-use skein_protocol::transition::{RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH, REWARD_TERM_NAMES, REWARD_TERMS};
+use skein_protocol::transition::{RecordKind, RecordLengths, TransitionRecord};
+use skein_protocol::{IMAGE_HEIGHT, IMAGE_WIDTH, REWARD_TERM_NAMES, REWARD_TERMS};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
 use crate::evaluation::EvaluatedEpisode;
-use AxisLength::{Fixed, Latent};
+use AxisLength::{Fixed, Latent, Numbers};
 
 // The arrays' types say little-endian, and rows are copied from memory.
 const _: () = assert!(cfg!(target_endian = "little"));
@@ -41,13 +41,16 @@ pub enum AxisLength {
     Fixed(usize),
     /// The length of the run's latent code.
     Latent,
+    /// The numbers of the run's actions.
+    Numbers,
 }
 
 impl AxisLength {
-    fn len(self, latent: usize) -> usize {
+    fn len(self, lengths: RecordLengths) -> usize {
         match self {
             Fixed(len) => len,
-            Latent => latent,
+            Latent => lengths.latent,
+            Numbers => lengths.action.numbers(),
         }
     }
 }
@@ -57,6 +60,7 @@ impl fmt::Display for AxisLength {
         match self {
             Fixed(len) => len.fmt(f),
             Latent => f.write_str("latent"),
+            Numbers => f.write_str("action"),
         }
     }
 }
@@ -68,8 +72,8 @@ pub struct RecordingRow<'a> {
     pub course: i32,
     /// Number of the episode on that course.
     pub episode: i32,
-    /// Length of the latent code.
-    pub latent: usize,
+    /// Lengths of code and action.
+    pub lengths: RecordLengths,
     /// The observation.
     pub record: &'a TransitionRecord,
 }
@@ -147,24 +151,27 @@ pub const COLUMNS: [Column; 16] = [
         "<f4",
         &[Latent],
         "latent code of the depth image",
-        |row, out| put(out, &row.record.latent[..row.latent]),
+        |row, out| put(out, &row.record.latent[..row.lengths.latent]),
     ),
     Column::new(
         "action",
         "<f4",
-        &[Fixed(ACTION)],
-        "commanded velocity left, up, in [-1, 1]; 0 in closing rows",
+        &[Numbers],
+        "action, each number in [-1, 1], in the order of action_names; 0 in closing rows",
         |row, out| {
-            put(out, &row.record.action);
+            put(out, &row.record.action[..row.lengths.action.numbers()]);
         },
     ),
     Column::new(
         "oracle_action",
         "<f4",
-        &[Fixed(ACTION)],
+        &[Numbers],
         "what the oracle would have commanded; 0 in closing rows",
         |row, out| {
-            put(out, &row.record.teacher_action);
+            put(
+                out,
+                &row.record.teacher_action[..row.lengths.action.numbers()],
+            );
         },
     ),
     Column::new(
@@ -209,13 +216,14 @@ pub const COLUMNS: [Column; 16] = [
 ];
 
 /// Arrays of names: name, shape, meaning.
-pub const NAME_LISTS: [(&str, &str, &str); 2] = [
+pub const NAME_LISTS: [(&str, &str, &str); 3] = [
     ("course_names", "[courses]", "names of the courses"),
     (
         "reward_term_names",
         "[terms]",
         "names of the reward's terms",
     ),
+    ("action_names", "[action]", "names of the action's numbers"),
 ];
 
 impl Column {
@@ -252,18 +260,17 @@ pub struct RecordingError {
     pub source: io::Error,
 }
 
-/// Writes the records of `episodes`, course by course, to `path` atomically. `latent` is the length
-/// of their codes.
+/// Writes the records of `episodes`, course by course, to `path` atomically.
 ///
 /// # Errors
 /// [`RecordingError`] names the file.
 pub fn write_recording(
     path: &Path,
     courses: &[&str],
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
-    write_atomically(path, |file| write_npz(file, courses, latent, episodes))
+    write_atomically(path, |file| write_npz(file, courses, lengths, episodes))
 }
 
 /// Writes the recording `path` with `write`, under another name until it is complete.
@@ -321,16 +328,16 @@ fn failed(path: &Path, source: io::Error) -> RecordingError {
 fn write_npz(
     path: &Path,
     courses: &[&str],
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> io::Result<()> {
     let rows: Vec<RecordingRow<'_>> = (0i32..)
         .zip(episodes)
-        .flat_map(|(course, episodes)| rows_of(course, latent, episodes))
+        .flat_map(|(course, episodes)| rows_of(course, lengths, episodes))
         .collect();
     let mut zip = ZipWriter::new(BufWriter::new(File::create(path)?));
     for column in &COLUMNS {
-        let shape: Vec<_> = column.shape.iter().map(|axis| axis.len(latent)).collect();
+        let shape: Vec<_> = column.shape.iter().map(|axis| axis.len(lengths)).collect();
         start_array(&mut zip, column.name, column.kind, rows.len(), &shape)?;
         let mut bytes = Vec::new();
         for row in &rows {
@@ -339,9 +346,20 @@ fn write_npz(
             zip.write_all(&bytes)?;
         }
     }
-    let [(course_names, ..), (reward_term_names, ..)] = NAME_LISTS;
+    let [
+        (course_names, ..),
+        (reward_term_names, ..),
+        (action_names, ..),
+    ] = NAME_LISTS;
+    let axes: Vec<_> = lengths
+        .action
+        .axes()
+        .iter()
+        .map(|axis| axis.name())
+        .collect();
     write_names(&mut zip, course_names, courses)?;
     write_names(&mut zip, reward_term_names, &REWARD_TERM_NAMES)?;
+    write_names(&mut zip, action_names, &axes)?;
     zip.finish()
         .map_err(io::Error::from)?
         .into_inner()?
@@ -370,14 +388,14 @@ fn write_names(
 
 fn rows_of(
     course: i32,
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[EvaluatedEpisode],
 ) -> impl Iterator<Item = RecordingRow<'_>> {
     (0i32..).zip(episodes).flat_map(move |(episode, flown)| {
         flown.records.iter().map(move |record| RecordingRow {
             course,
             episode,
-            latent,
+            lengths,
             record,
         })
     })
@@ -418,10 +436,16 @@ mod tests {
     use std::io::Read;
 
     use bytemuck::Zeroable;
+    use skein_protocol::ActionSpace;
     use skein_protocol::evaluation::EpisodeScore;
     use skein_protocol::transition::Outcome;
 
     use super::*;
+
+    const LENGTHS: RecordLengths = RecordLengths {
+        latent: 8,
+        action: ActionSpace::Velocity,
+    };
 
     fn episode(first: u8, records: u8) -> EvaluatedEpisode {
         let record = |number: u8| {
@@ -429,6 +453,7 @@ mod tests {
             record.depth.fill(number);
             record.latent = std::array::from_fn(|index| f32::from(number) + index as f32);
             record.position_m = [f32::from(number), 0.5, -1.0];
+            record.action = [f32::from(number), 0.25, 0.5, 0.0];
             record
         };
         let score = EpisodeScore {
@@ -475,7 +500,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("episodes.npz");
         let episodes = [vec![episode(1, 2), episode(3, 1)], vec![episode(4, 1)]];
-        write_recording(&file, &["near", "far \u{e4}"], 8, &episodes).unwrap();
+        write_recording(&file, &["near", "far \u{e4}"], LENGTHS, &episodes).unwrap();
 
         let (header, depth) = array(&file, "depth");
         assert!(
@@ -499,6 +524,14 @@ mod tests {
         let (header, latent) = array(&file, "latent");
         assert!(header.contains("(4, 8,)"), "{header}");
         assert_eq!(values::<f32>(&latent)[14..18], [8.0, 9.0, 3.0, 4.0]);
+        let (header, actions) = array(&file, "action");
+        assert!(header.contains("(4, 3,)"), "{header}");
+        assert_eq!(values::<f32>(&actions)[3..6], [2.0, 0.25, 0.5]);
+        let (header, _) = array(&file, "action_names");
+        assert!(
+            header.contains("'<U7'") && header.contains("(3,)"),
+            "{header}"
+        );
         let (header, names) = array(&file, "course_names");
         assert!(
             header.contains("'<U5'") && header.contains("(2,)"),
@@ -521,14 +554,14 @@ mod tests {
     fn every_array_has_as_many_values_as_its_header_says() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("episodes.npz");
-        write_recording(&file, &["near"], 8, &[vec![episode(0, 3)]]).unwrap();
+        write_recording(&file, &["near"], LENGTHS, &[vec![episode(0, 3)]]).unwrap();
         for column in &COLUMNS {
             let value_bytes: usize = column.kind[2..].parse().unwrap();
             let expected = 3
                 * column
                     .shape
                     .iter()
-                    .map(|axis| axis.len(8))
+                    .map(|axis| axis.len(LENGTHS))
                     .product::<usize>()
                 * value_bytes;
             assert_eq!(
@@ -545,7 +578,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("missing/episodes.npz");
         for error in [
-            write_recording(&file, &[], 32, &[]),
+            write_recording(&file, &[], LENGTHS, &[]),
             check_recordable(&file),
         ] {
             let error = error.unwrap_err().to_string();
@@ -559,7 +592,7 @@ mod tests {
         let [target, link] = ["there.npz", "link.npz"].map(|name| folder.path().join(name));
         std::os::unix::fs::symlink(&target, &link).unwrap();
         check_recordable(&link).unwrap();
-        write_recording(&link, &[], 32, &[]).unwrap();
+        write_recording(&link, &[], LENGTHS, &[]).unwrap();
         assert!(link.is_symlink() && target.is_file());
     }
 
@@ -580,7 +613,7 @@ mod tests {
         assert!(check_recordable(&at("folder")).is_err());
         let _socket = std::os::unix::net::UnixListener::bind(at("socket")).unwrap();
         assert!(check_recordable(&at("socket")).is_err());
-        write_recording(&at("folder"), &["near"], 32, &[vec![episode(0, 1)]]).unwrap_err();
+        write_recording(&at("folder"), &["near"], LENGTHS, &[vec![episode(0, 1)]]).unwrap_err();
         check_recordable(&at("earlier.npz")).unwrap();
         check_recordable(&at("new.npz")).unwrap();
         assert_eq!(names(), ["earlier.npz", "folder", "socket"]);

@@ -5,7 +5,7 @@
 
 use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::TransitionRecord;
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::{Action, IMAGE_PIXELS};
 use skein_simulator::reward::{RewardSettings, RewardTerms};
 use skein_simulator::simulator::{Simulator, StepReport};
 
@@ -45,13 +45,13 @@ pub trait World {
     ///
     /// # Errors
     /// [`EpisodeFault`]; the episode is lost.
-    fn step(&mut self, action: [f32; ACTION]) -> Result<StepReport, EpisodeFault>;
+    fn step(&mut self, action: Action) -> Result<StepReport, EpisodeFault>;
 
-    /// Returns the action of an oracle that knows the course, each command in [-1, 1].
+    /// Returns the action of an oracle that knows the course, each number in [-1, 1].
     ///
     /// # Errors
     /// [`EpisodeFault::Foreign`] if the world has no oracle.
-    fn oracle_action(&mut self) -> Result<[f32; ACTION], EpisodeFault>;
+    fn oracle_action(&mut self) -> Result<Action, EpisodeFault>;
 
     /// Returns the reward of the last step, whose result is `report`, after which the camera saw
     /// `image_after`.
@@ -95,11 +95,11 @@ impl World for Simulator {
         record.ground_truth = self.ground_truth().numbers();
     }
 
-    fn step(&mut self, action: [f32; ACTION]) -> Result<StepReport, EpisodeFault> {
+    fn step(&mut self, action: Action) -> Result<StepReport, EpisodeFault> {
         Ok(Simulator::step(self, action)?)
     }
 
-    fn oracle_action(&mut self) -> Result<[f32; ACTION], EpisodeFault> {
+    fn oracle_action(&mut self) -> Result<Action, EpisodeFault> {
         Ok(Simulator::oracle_action(self))
     }
 

@@ -1,8 +1,8 @@
 //! The environment step, half a second of an episode: physics alone, and with the depth image.
 //!
 //! An iteration is a whole episode through the training course, flown by the oracle, with its
-//! reset. `random_course` is what an episode on a new course adds: to generate it, and to build its
-//! simulator.
+//! reset; so in a forest. `random_course` and `random_world` are what an episode on a new course
+//! adds: to generate it, and to build its simulator.
 
 use std::hint::black_box;
 use std::path::Path;
@@ -12,7 +12,9 @@ use criterion::{BenchmarkId, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::IMAGE_PIXELS;
-use skein_simulator::course::{Course, GeneratorRanges};
+use skein_simulator::course::{
+    Course, ForestRanges, GatesRanges, GeneratorRanges, HallRanges, RoomsRanges, WorldRanges,
+};
 use skein_simulator::simulator::{Simulator, SimulatorSettings};
 use skein_simulator::vehicle::{Preset, VehicleSettings};
 
@@ -54,8 +56,48 @@ fn main() {
         }
     }
     group.finish();
+    random_worlds(&mut criterion);
     random_course(&mut criterion);
     criterion.final_summary();
+}
+
+/// Steps in the densest default forest, and what a random world of each kind costs.
+fn random_worlds(criterion: &mut Criterion) {
+    let dense = ForestRanges {
+        density_per_m2: [1.0 / 16.0; 2],
+        ..Default::default()
+    };
+    let of = |world| GeneratorRanges {
+        worlds: vec![world],
+        ..Default::default()
+    };
+    let generate = |seed, ranges: &GeneratorRanges| {
+        Course::generate(seed, ranges).expect("default ranges can be flown")
+    };
+    let forest = Arc::new(generate(1, &of(WorldRanges::Forest(dense.clone()))));
+    let mut simulator =
+        Simulator::new(forest, &SimulatorSettings::default()).expect("default settings are valid");
+    let mut group = criterion.benchmark_group("environment_step");
+    group.throughput(Throughput::Elements(fly(&mut simulator, Camera::Off)));
+    for (camera, what) in [(Camera::Off, "physics"), (Camera::On, "with_camera")] {
+        group.bench_function(BenchmarkId::new(what, "forest"), |bencher| {
+            bencher.iter(|| fly(&mut simulator, camera));
+        });
+    }
+    group.finish();
+    let mut group = criterion.benchmark_group("random_world");
+    for world in [
+        WorldRanges::Forest(dense),
+        WorldRanges::Hall(HallRanges::default()),
+        WorldRanges::Rooms(RoomsRanges::default()),
+        WorldRanges::Gates(GatesRanges::default()),
+    ] {
+        let (name, ranges, mut seeds) = (world.name(), of(world.clone()), 0..);
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| generate(seeds.next().expect("seeds are endless"), &ranges));
+        });
+    }
+    group.finish();
 }
 
 fn random_course(criterion: &mut Criterion) {

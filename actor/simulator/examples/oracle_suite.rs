@@ -1,7 +1,8 @@
 //! Flies the oracle through an evaluation suite, for comparison with a policy.
 //!
-//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes]`
-//! (by default configs/evaluations/generalist.toml and its number of episodes).
+//! `cargo run --release -p skein-simulator --example oracle_suite [suite] [episodes] [config]`
+//! (by default configs/evaluations/generalist.toml, its number of episodes, and the default drone;
+//! else the drone of this configuration's `[simulator]`).
 //!
 //! The gap between a policy and the oracle is what the policy could still learn. The gap between
 //! the oracle and 100 % is due to the drone or to the oracle's simple rule. Depth noise has no
@@ -27,19 +28,38 @@ fn main() -> Result<(), Box<dyn Error>> {
         .next()
         .map(|argument| argument.parse())
         .transpose()?;
+    let settings = arguments
+        .next()
+        .map_or(Ok(SimulatorSettings::default()), settings_of)?;
     println!(
         "{:<34} {:>7} {:>9} {:>7}  hit wall, hit corridor, timed out",
         "entry", "episodes", "completed", "R"
     );
     for entry in &suite.entries {
-        println!("{}", row(entry, episodes.unwrap_or(entry.episodes))?);
+        println!(
+            "{}",
+            row(entry, episodes.unwrap_or(entry.episodes), &settings)?
+        );
     }
     Ok(())
 }
 
+/// Reads the simulator's settings from a configuration.
+fn settings_of(config: String) -> Result<SimulatorSettings, Box<dyn Error>> {
+    let mut config: toml::Table = toml::from_str(&std::fs::read_to_string(config)?)?;
+    let section = config
+        .remove("simulator")
+        .unwrap_or(toml::Table::new().into());
+    Ok(section.try_into()?)
+}
+
 /// Flies an entry and returns its row of the table.
-fn row(entry: &SuiteEntry, episodes: u64) -> Result<String, Box<dyn Error>> {
-    let settings = entry.settings(&SimulatorSettings::default());
+fn row(
+    entry: &SuiteEntry,
+    episodes: u64,
+    settings: &SimulatorSettings,
+) -> Result<String, Box<dyn Error>> {
+    let settings = entry.settings(settings);
     let (mut arrived, mut passed, mut walls) = (0, 0, 0);
     let (mut hit_wall, mut hit_corridor, mut timed_out) = (0, 0, 0);
     for episode in 0..episodes {

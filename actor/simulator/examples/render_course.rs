@@ -1,4 +1,5 @@
-//! Writes depth images from before each wall of a course as PNG files.
+//! Writes depth images from before each wall of a course, or from where each stage of a world
+//! starts, as PNG files.
 //!
 //! ```text
 //! cargo run --release -p skein-simulator --example render_course -- \
@@ -8,12 +9,16 @@
 use std::error::Error;
 use std::fs::File;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+use rand::SeedableRng;
+use rand_pcg::Pcg64Mcg;
 use skein_simulator::camera::{
     CameraSettings, DepthCamera, IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH,
 };
 use skein_simulator::course::Course;
+use skein_simulator::simulator::{Simulator, SimulatorSettings};
 
 /// Distance of the camera before a wall, metres.
 const BEFORE_M: f32 = 4.0;
@@ -25,6 +30,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let course = Course::load(course)?;
     std::fs::create_dir_all(folder)?;
+    if course.is_world() {
+        return render_stages(course, folder);
+    }
     let mut camera = DepthCamera::new(&CameraSettings::default(), &course)?;
     let mut image = [0; IMAGE_PIXELS];
     for wall in course.walls() {
@@ -41,6 +49,22 @@ fn main() -> Result<(), Box<dyn Error>> {
             write_png(&path, &image)?;
             println!("{}", path.display());
         }
+    }
+    Ok(())
+}
+
+/// Writes the image from where each stage of a world starts.
+fn render_stages(course: Course, folder: &Path) -> Result<(), Box<dyn Error>> {
+    let levels = course.levels();
+    let mut simulator = Simulator::new(Arc::new(course), &SimulatorSettings::default())?;
+    let mut image = [0; IMAGE_PIXELS];
+    for level in 1..=levels {
+        let [mut start, mut calm] = [1, 2].map(Pcg64Mcg::seed_from_u64);
+        simulator.reset(level, &mut start, &mut calm)?;
+        simulator.render(&mut image);
+        let path = folder.join(format!("stage{level}.png"));
+        write_png(&path, &image)?;
+        println!("{}", path.display());
     }
     Ok(())
 }

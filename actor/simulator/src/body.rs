@@ -62,7 +62,13 @@ impl Body {
                 body.apply_torque_impulse(glam(torque_nm) * dt_secs, false);
                 body.set_angvel(body.angvel_with_gyroscopic_forces(dt_secs), false);
             }
-            Actuation::Velocity(velocity_mps) => body.set_linvel(glam(velocity_mps), false),
+            Actuation::Motion {
+                velocity_mps,
+                yaw_rate_radps,
+            } => {
+                body.set_linvel(glam(velocity_mps), false);
+                body.set_angvel(glam(&(Vector3::z() * *yaw_rate_radps)), false);
+            }
         }
         let mut pose = body.predict_position_using_velocity(dt_secs);
         // Otherwise rounding would stretch the quaternion step by step.

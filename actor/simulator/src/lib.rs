@@ -1,17 +1,17 @@
-//! The walled corridor, the quadrotor that flies through it, and its depth camera.
+//! Courses, the quadrotor that flies through them, and its depth camera.
 //!
 //! The crate is usable alone: it knows nothing of actors, learners or transports. Everything is
 //! `f32` and deterministic. On one machine type, the same course, settings, start and actions give
 //! the same episode, bit for bit.
 //!
-//! World frame: x forward along the corridor, y to the left, z up. Body frame: x forward, y left, z
+//! World frame: x forward along the course, y to the left, z up. Body frame: x forward, y left, z
 //! up. Units are metres, seconds and radians, unless a name says otherwise.
 //!
 //! | module | content |
 //! |---|---|
 //! | [`simulator`] | [`Simulator`](simulator::Simulator): `reset`, `step`, `render` |
 //! | [`reward`] | the four terms of the reward and their sizes |
-//! | [`course`] | corridor, walls and openings; course files; random courses |
+//! | [`course`] | corridors with walls and openings, worlds of obstacles; their files; random ones |
 //! | [`vehicle`] | drone presets and their flight controller |
 //! | [`camera`] | depth image, with or without a stereo camera's errors |
 //! | [`disturbances`] | gusts, latency, mass, depth noise |
@@ -28,7 +28,10 @@ pub mod reward;
 pub mod simulator;
 mod step_report;
 pub mod suite;
+mod surfaces;
 pub mod text;
 pub mod vehicle;
 pub mod viewpoints;
 mod world;
+
+pub use skein_action::{Action, ActionSpace};

@@ -14,19 +14,33 @@ const MOST_BYTES: u64 = 1 << 20;
 /// Reads a text file.
 ///
 /// # Errors
-/// If the file cannot be read, exceeds [`MOST_BYTES`], or is not a regular file: reading a pipe or
-/// a device might never end.
+/// As [`read_file`], or if it is not UTF-8.
 pub(crate) fn read_text(path: &Path) -> io::Result<String> {
+    let bytes = read_file(path, MOST_BYTES)?;
+    String::from_utf8(bytes).map_err(|_| {
+        io::Error::new(
+            io::ErrorKind::InvalidData,
+            "stream did not contain valid UTF-8",
+        )
+    })
+}
+
+/// Reads a file.
+///
+/// # Errors
+/// If the file cannot be read, exceeds `most_bytes`, or is not a regular file: reading a pipe or a
+/// device might never end.
+pub(crate) fn read_file(path: &Path, most_bytes: u64) -> io::Result<Vec<u8>> {
     let about = fs::metadata(path)?;
     if about.is_dir() {
         return Err(io::Error::other("it is a folder: name a file"));
     }
-    if !about.is_file() || about.len() > MOST_BYTES {
+    if !about.is_file() || about.len() > most_bytes {
         return Err(io::Error::other(format!(
-            "not a regular file of at most {MOST_BYTES} bytes"
+            "not a regular file of at most {most_bytes} bytes"
         )));
     }
-    fs::read_to_string(path)
+    fs::read(path)
 }
 
 /// Parses TOML of which every part is used.

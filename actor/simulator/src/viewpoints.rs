@@ -88,6 +88,7 @@ impl Viewpoints {
         };
         // Always drawn, so that the poses do not depend on the disturbances.
         let (noisy, key) = (rng.random::<f32>() < self.noisy_share, rng.random());
+        self.camera.move_obstacles(self.world.moment());
         self.camera.render(&pose, clean);
         match noisy {
             true => self.camera.render_with_noise(&pose, key, image),
@@ -118,11 +119,17 @@ impl Viewpoints {
                 UnitQuaternion::from_euler_angles(roll, pitch, 0.0),
             );
             let inside = y_m.abs() < half_y && (0.0..height).contains(&z_m);
-            (inside && self.world.is_free_at(&pose)).then_some(pose)
+            let is_free = inside
+                && self
+                    .course
+                    .is_reachable(&Point3::from(pose.translation.vector))
+                && self.world.is_free_at(&pose);
+            is_free.then_some(pose)
         })
     }
 
-    /// Returns the point `[y, z]` at `x_m` of the straight way through the openings, metres.
+    /// Returns the point `[y, z]` at `x_m` of the straight way through the openings, metres. In a
+    /// world, it is the middle of the cross-section.
     fn way_at(&self, x_m: f32) -> [f32; 2] {
         let corridor = self.course.corridor();
         let middle = [0.0, corridor.height_m / 2.0];

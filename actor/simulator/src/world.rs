@@ -5,36 +5,45 @@
 //! inside is a box, so the cuboid's bounds decide whether it touches that; a wall is tested,
 //! triangle by triangle, only while the bounds reach into it. The body moves centimetres a step and
 //! is longer than that in every direction it can move, so it cannot pass a surface between two
-//! tests.
+//! tests. Obstacles that stand still are one set of triangles in a tree of boxes. A moving one keeps
+//! its triangles: the body is seen from it.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use rapier3d::math::{Pose, Rotation};
 use rapier3d::parry::bounding_volume::Aabb;
-use rapier3d::parry::query::{DefaultQueryDispatcher, QueryDispatcher};
-use rapier3d::parry::shape::{Cuboid, Shape, TriMesh, TriMeshBuilderError};
+use rapier3d::parry::shape::{Cuboid, Shape, TriMeshBuilderError};
 
 use crate::body::{Body, glam};
-use crate::course::{Course, Mesh, SurfaceKind, Wall};
+use crate::course::{Course, Mesh, Moment, Motion, Region, SurfaceKind, Wall};
+use crate::surfaces::Surfaces;
 use crate::vehicle::{Actuation, BodyProperties, VehicleState};
 
 /// Contact of the body with the course.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Contact {
     Nothing,
-    /// The corridor, a wall, or the inside of an opening.
+    /// The corridor, a wall, the inside of an opening, or an obstacle of a world.
     Obstacle,
-    /// The wall at the corridor's end and nothing else.
+    /// The destination and nothing else: the wall at the corridor's end, or the goal of a world.
     EndWall,
 }
 
 /// A wall that the body may touch.
 struct WallBody {
-    surfaces: TriMesh,
+    surfaces: Surfaces,
     front_m: f32,
     back_m: f32,
     /// Middle `[y, z]` of a disc inside the opening.
     free_middle_m: [f32; 2],
     free_radius_m: f32,
+}
+
+/// An obstacle that moves.
+struct MovingBody {
+    surfaces: Surfaces,
+    motion: Motion,
+    /// Place among the course's obstacles.
+    number: usize,
 }
 
 /// The vehicle's body in the course.
@@ -43,6 +52,12 @@ pub(crate) struct World {
     interior: Aabb,
     /// The walls in course order.
     walls: Vec<WallBody>,
+    /// All obstacles that stand still; `None` if there are none.
+    still: Option<Surfaces>,
+    moving: Vec<MovingBody>,
+    /// Goal of a world; `None` in a corridor, whose end is the destination.
+    goal: Option<Region>,
+    moment: Moment,
     body_shape: Cuboid,
     nominal: BodyProperties,
     dt_secs: f32,
@@ -63,11 +78,16 @@ impl World {
         dt_secs: f32,
     ) -> Result<Self, TriMeshBuilderError> {
         let mesh = course.mesh();
+        let (still, moving) = obstacle_bodies(course)?;
         let body = Body::at_rest(&properties, &Point3::origin(), dt_secs);
         let body_shape = Cuboid::new(glam(&properties.half_extents_m));
         Ok(Self {
-            interior: interior(&mesh),
+            interior: interior(course),
             walls: wall_bodies(&mesh, course)?,
+            still,
+            moving,
+            goal: course.goal(),
+            moment: Moment::default(),
             bounds: body_shape.compute_aabb(body.pose()),
             body_shape,
             nominal: properties,
@@ -77,8 +97,13 @@ impl World {
     }
 
     /// Puts a new body at rest at `position_m`, with `mass_factor` times the nominal mass: an
-    /// episode depends on its start and actions alone.
-    pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32) {
+    /// episode depends on its start and actions alone. Moving obstacles start where `motion_seed`
+    /// puts them.
+    pub(crate) fn reset(&mut self, position_m: &Point3<f32>, mass_factor: f32, motion_seed: u64) {
+        self.moment = Moment {
+            secs: 0.0,
+            seed: motion_seed,
+        };
         let properties = self.nominal.scaled(mass_factor);
         self.body = Body::at_rest(&properties, position_m, self.dt_secs);
         self.bounds = self.body_shape.compute_aabb(self.body.pose());
@@ -88,12 +113,18 @@ impl World {
     /// If the state is no longer finite, [`World::is_quarantined`] returns `true`.
     pub(crate) fn advance(&mut self, actuation: &Actuation, gust_n: Option<Vector3<f32>>) {
         self.body.advance(actuation, gust_n);
+        self.moment.secs += self.dt_secs;
         self.bounds = self.body_shape.compute_aabb(self.body.pose());
     }
 
     /// Returns the body's pose and motion.
     pub(crate) fn state(&self) -> VehicleState {
         self.body.state()
+    }
+
+    /// Returns the instant, which places the moving obstacles.
+    pub(crate) fn moment(&self) -> Moment {
+        self.moment
     }
 
     /// Returns the position of the body's rearmost point along the corridor, m.
@@ -127,6 +158,11 @@ impl World {
         self.contact_at(&pose, &self.body_shape.compute_aabb(&pose)) != Contact::Obstacle
     }
 
+    /// Returns `true` if the body touches an obstacle of a world.
+    pub(crate) fn touches_obstacle(&self) -> bool {
+        self.touches_obstacle_at(self.body.pose())
+    }
+
     /// Returns what a body of these `bounds` touches at `world_from_body`.
     fn contact_at(&self, world_from_body: &Pose, bounds: &Aabb) -> Contact {
         let inside = &self.interior;
@@ -134,24 +170,34 @@ impl World {
             || bounds.maxs.y >= inside.maxs.y
             || bounds.maxs.z >= inside.maxs.z;
         let mut walls = self.walls.iter();
-        if touches_corridor || walls.any(|wall| self.touches(world_from_body, bounds, wall)) {
-            Contact::Obstacle
-        } else if bounds.maxs.x >= inside.maxs.x {
-            Contact::EndWall
-        } else {
-            Contact::Nothing
+        let touches_end = bounds.maxs.x >= inside.maxs.x;
+        if touches_corridor
+            || walls.any(|wall| self.touches(world_from_body, bounds, wall))
+            || self.touches_obstacle_at(world_from_body)
+        {
+            return Contact::Obstacle;
+        }
+        match &self.goal {
+            Some(_) if touches_end => Contact::Obstacle,
+            Some(goal) if goal.contains(&point(world_from_body)) => Contact::EndWall,
+            None if touches_end => Contact::EndWall,
+            _ => Contact::Nothing,
         }
     }
 
     fn touches(&self, world_from_body: &Pose, bounds: &Aabb, wall: &WallBody) -> bool {
-        if !wall.is_near(bounds) {
-            return false;
-        }
-        DefaultQueryDispatcher
-            .intersection_test(&world_from_body.inverse(), &self.body_shape, &wall.surfaces)
-            // Fails for unsupported shapes alone. A failure must never mean "no contact".
-            .expect("parry tests a cuboid against a triangle mesh")
-            .intersecting
+        wall.is_near(bounds) && wall.surfaces.touch(world_from_body, &self.body_shape)
+    }
+
+    fn touches_obstacle_at(&self, world_from_body: &Pose) -> bool {
+        let touches_moving = |obstacle: &MovingBody| {
+            let offset_m = obstacle.motion.offset_m(obstacle.number, self.moment);
+            let seen_from_it = world_from_body.append_translation(-glam(&offset_m));
+            obstacle.surfaces.touch(&seen_from_it, &self.body_shape)
+        };
+        let still = self.still.as_ref();
+        still.is_some_and(|still| still.touch(world_from_body, &self.body_shape))
+            || self.moving.iter().any(touches_moving)
     }
 }
 
@@ -170,13 +216,13 @@ impl WallBody {
 }
 
 /// Returns the box whose sides are the corridor's surfaces and the end wall.
-fn interior(mesh: &Mesh) -> Aabb {
-    let surfaces = mesh
-        .surfaces
-        .iter()
-        .filter(|surface| !matches!(surface.kind, SurfaceKind::Wall(_)));
-    let vertices = surfaces.flat_map(|surface| surface.loops.iter().flatten());
-    Aabb::from_points(vertices.map(|&vertex| glam(&mesh.vertices[vertex as usize].coords)))
+fn interior(course: &Course) -> Aabb {
+    let corridor = course.corridor();
+    let half_m = corridor.width_m / 2.0;
+    Aabb::new(
+        glam(&Vector3::new(0.0, -half_m, 0.0)),
+        glam(&Vector3::new(corridor.length_m, half_m, corridor.height_m)),
+    )
 }
 
 /// Returns the walls of `course` with their triangles.
@@ -188,8 +234,9 @@ fn wall_bodies(mesh: &Mesh, course: &Course) -> Result<Vec<WallBody>, TriMeshBui
     let of_wall = |(place, wall): (usize, &Wall)| {
         let is_of_wall = |surface: usize| mesh.surfaces[surface].kind == SurfaceKind::Wall(place);
         let chosen = triangles.iter().filter(|(_, surface)| is_of_wall(*surface));
+        let chosen = chosen.map(|(triangle, _)| *triangle).collect();
         Ok(WallBody {
-            surfaces: triangle_mesh(mesh, chosen.map(|(triangle, _)| *triangle).collect())?,
+            surfaces: Surfaces::of_triangles(mesh, chosen)?,
             front_m: wall.x_m(),
             back_m: wall.x_m() + course.wall_thickness_m(),
             free_middle_m: wall.safe_point(),
@@ -199,22 +246,32 @@ fn wall_bodies(mesh: &Mesh, course: &Course) -> Result<Vec<WallBody>, TriMeshBui
     course.walls().iter().enumerate().map(of_wall).collect()
 }
 
-/// Returns `triangles` as a mesh, with their own vertices alone.
-fn triangle_mesh(
-    mesh: &Mesh,
-    mut triangles: Vec<[u32; 3]>,
-) -> Result<TriMesh, TriMeshBuilderError> {
-    let used = triangles.iter().flatten().copied();
-    let first = used.clone().min().unwrap_or(0);
-    let end = used.max().map_or(0, |last| last + 1);
-    for corner in triangles.iter_mut().flatten() {
-        *corner -= first;
+/// Returns the obstacles of `course` that stand still, and those that move.
+fn obstacle_bodies(
+    course: &Course,
+) -> Result<(Option<Surfaces>, Vec<MovingBody>), TriMeshBuilderError> {
+    let (mut still, mut moving) = (Mesh::default(), Vec::new());
+    for (number, obstacle) in course.obstacles().iter().enumerate() {
+        match obstacle.motion {
+            None => still.append(obstacle.mesh()),
+            Some(motion) => moving.push(MovingBody {
+                surfaces: Surfaces::of(&obstacle.mesh())?,
+                motion,
+                number,
+            }),
+        }
     }
-    let vertices = &mesh.vertices[first as usize..end as usize];
-    TriMesh::new(
-        vertices.iter().map(|vertex| glam(&vertex.coords)).collect(),
-        triangles,
-    )
+    let still = match still.surfaces.is_empty() {
+        true => None,
+        false => Some(Surfaces::of(&still)?),
+    };
+    Ok((still, moving))
+}
+
+/// Returns the place of a body's middle.
+fn point(world_from_body: &Pose) -> Point3<f32> {
+    let [x, y, z] = world_from_body.translation.into();
+    Point3::new(x, y, z)
 }
 
 #[cfg(test)]
@@ -235,7 +292,7 @@ mod tests {
 
     fn world_at(position_m: Point3<f32>) -> World {
         let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
-        world.reset(&position_m, 1.0);
+        world.reset(&position_m, 1.0, 0);
         world
     }
 
@@ -403,8 +460,8 @@ mod tests {
         let is_obstacle = |surface: usize| mesh.surfaces[surface].kind != SurfaceKind::EndWall;
         let triangles = mesh.triangles().into_iter();
         let obstacles = triangles.filter(|(_, surface)| is_obstacle(*surface));
-        let obstacles = triangle_mesh(&mesh, obstacles.map(|(triangle, _)| triangle).collect());
-        let obstacles = obstacles.unwrap();
+        let obstacles = obstacles.map(|(triangle, _)| triangle).collect();
+        let obstacles = Surfaces::of_triangles(&mesh, obstacles).unwrap();
 
         let mut world = world_at(Point3::origin());
         let mut rng = Pcg64Mcg::seed_from_u64(1);
@@ -421,10 +478,7 @@ mod tests {
             let turn = Rotation::from_euler(EulerRot::XYZ, turn(0.6), turn(0.6), turn(3.0));
             let pose = Pose::from_parts(Vector::new(x_m, y_m, z_m), turn);
             world.put(pose);
-            let expected = DefaultQueryDispatcher
-                .intersection_test(&pose.inverse(), &world.body_shape, &obstacles)
-                .unwrap()
-                .intersecting;
+            let expected = obstacles.touch(&pose, &world.body_shape);
             touched += u32::from(expected);
             assert_eq!(world.contact() == Contact::Obstacle, expected, "{pose:?}");
         }
@@ -434,7 +488,7 @@ mod tests {
     #[test]
     fn twice_the_mass_is_moved_half_as_far_and_falls_alike() {
         let mut world = World::new(&test_course(), PROPERTIES, 0.005).unwrap();
-        world.reset(&Point3::new(5.0, 0.0, 6.0), 2.0);
+        world.reset(&Point3::new(5.0, 0.0, 6.0), 2.0, 0);
         push(
             &mut world,
             Vector3::new(1.0, 0.0, 0.0),

@@ -1,6 +1,6 @@
 //! Checks the claims of the comments in `configs/courses/`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use skein_simulator::course::{Course, DRONE_WIDTH_M, Shape};
 
@@ -111,4 +111,17 @@ fn inside(points: &[[f32; 2]], [y, z]: [f32; 2]) -> bool {
         .count()
         % 2
         == 1
+}
+
+#[test]
+fn every_shipped_world_has_a_start_a_goal_and_a_way_between() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/worlds");
+    for (name, moving) in [("forest", 0), ("hall", 3), ("apartment", 0)] {
+        let course = Course::load(folder.join(name).with_extension("toml")).unwrap();
+        assert_eq!(course.name(), name);
+        assert!(course.is_world() && course.goal().is_some());
+        let obstacles = course.obstacles().iter();
+        let moves = obstacles.filter(|obstacle| obstacle.motion.is_some());
+        assert_eq!(moves.count(), moving, "{name}");
+    }
 }

@@ -27,6 +27,7 @@ use skein_protocol::config::{Config, failing_override};
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::files::destination;
 use skein_protocol::snapshot::Snapshot;
+use skein_protocol::transition::RecordLengths;
 use skein_reports::{MOST_DRAWN, unfinished_picture};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::{EvaluatedEpisode, Evaluation, Keep, MAX_THREADS};
@@ -222,7 +223,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         write_json(file, &report)
     });
     let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
-        record(file, &courses, config.vae.latent, &evaluated.episodes)
+        record(file, &courses, config.record_lengths(), &evaluated.episodes)
     });
     let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
         plot::draw(&courses, &evaluated.episodes, file)
@@ -255,17 +256,17 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
 fn record(
     file: &Path,
     courses: &Courses,
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
     match file.extension() {
         Some(extension) if extension == "mcap" => {
-            write_atomically(file, |file| mcap::write(file, courses, latent, episodes))
+            write_atomically(file, |file| mcap::write(file, courses, lengths, episodes))
         }
         _ => {
             let entries = courses.evaluation();
             let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
-            write_recording(file, &names, latent, episodes)
+            write_recording(file, &names, lengths, episodes)
         }
     }
 }

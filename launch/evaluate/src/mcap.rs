@@ -3,23 +3,24 @@
 use std::io;
 use std::path::Path;
 
+use skein_protocol::transition::RecordLengths;
 use skein_recordings::{Episode, Recording};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::EvaluatedEpisode;
 
-/// Writes `episodes`, entry by entry, to `path`. `latent` is the length of their codes.
+/// Writes `episodes`, entry by entry, to `path`.
 ///
 /// # Errors
 /// Of the file, or if a course cannot be generated again.
 pub(crate) fn write(
     path: &Path,
     courses: &Courses,
-    latent: usize,
+    lengths: RecordLengths,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> io::Result<()> {
     let entries = courses.evaluation();
     let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
-    let mut recording = Recording::create(path, courses.settings(), &names)?;
+    let mut recording = Recording::create(path, courses.settings(), lengths.action, &names)?;
     for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
         for (number, episode) in (0..).zip(episodes) {
             let course = entry.courses.of_episode(number);
@@ -28,7 +29,7 @@ pub(crate) fn write(
                 title: &format!("{}, episode {number}", entry.name),
                 course: (&course, entry_number),
                 number: number as i32,
-                latent,
+                lengths,
                 score: episode.score,
             };
             recording.add(&header, episode.records.iter().map(|record| &**record))?;

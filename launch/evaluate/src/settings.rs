@@ -72,9 +72,6 @@ pub(crate) fn with_overrides(
                 their own; change the suite, or name courses with --course"
             );
         }
-        if is_in("simulator") || key == "run.seed" {
-            continue;
-        }
         let alone = config.overridden(snapshot, std::slice::from_ref(text));
         if alone.is_ok_and(|alone| has_other_networks(config, &alone)) {
             bail!(
@@ -82,6 +79,9 @@ pub(crate) fn with_overrides(
                 they were trained; train a policy with this setting",
                 snapshot.display()
             );
+        }
+        if is_in("simulator") || key == "run.seed" {
+            continue;
         }
         bail!(
             "--set {text}: {key} has no effect on an evaluation; only keys in [simulator] and \
@@ -133,6 +133,10 @@ mod tests {
             ),
             ("learning.history_steps=[2]", "would change the networks"),
             ("vae.latent=16", "would change the networks"),
+            (
+                "simulator.vehicle.action=velocity",
+                "would change the networks",
+            ),
             ("sac.hidden_width=64", "would change the networks"),
             ("sac.discount=0.9", "only keys in [simulator]"),
             ("run.episodes=9", "only keys in [simulator]"),

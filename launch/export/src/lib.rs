@@ -4,9 +4,9 @@
 //! | name | type, shape | meaning |
 //! |---|---|---|
 //! | `depth` | u8 `[batch, 1, 72, 128]` | depth image; 255 is the range or farther |
-//! | `velocity` | f32 `[batch, 3]` | forward, left, up, m/s |
+//! | `velocity` | f32 `[batch, 3]` | forward, left, up in the heading frame, m/s |
 //! | `history` | f32 `[batch, rows, width]` | zeros at a reset, else the last `next_history` |
-//! | `action` | f32 `[batch, 2]` | velocity to command left and up, m/s, in [-1, 1] |
+//! | `action` | f32 `[batch, action]` | numbers of `simulator.vehicle.action`, in [-1, 1] |
 //! | `next_history` | as `history` | for the next call |
 //!
 //! The history holds a row for each of the last steps, the newest first: what the policy saw of it,
@@ -26,7 +26,7 @@ use skein_protocol::files::destination;
 use skein_protocol::snapshot::{
     POLICY_LAYERS, PolicyHead, Snapshot, SnapshotError, SnapshotLayout,
 };
-use skein_protocol::{ACTION, IMAGE_HEIGHT, IMAGE_WIDTH};
+use skein_protocol::{ActionSpace, IMAGE_HEIGHT, IMAGE_WIDTH};
 
 use graph::{Attribute, Graph, Length, Number};
 use messages::{ModelProto, OperatorSetIdProto, StringStringEntryProto};
@@ -99,7 +99,7 @@ pub fn onnx(snapshot: &Snapshot, config: &Config) -> Vec<u8> {
     inputs(&mut graph, &view);
     encode(&mut graph);
     remember(&mut graph, config, &view);
-    act(&mut graph, layout.head());
+    act(&mut graph, layout.head(), view.action);
     pass_on(&mut graph, &view);
     outputs(&mut graph, &view);
     let model = ModelProto {
@@ -122,6 +122,8 @@ struct History {
     rows: usize,
     /// Input of a step, without action and mark.
     step_len: usize,
+    /// Numbers of an action.
+    action: ActionSpace,
 }
 
 impl History {
@@ -131,11 +133,12 @@ impl History {
             // At least the previous action, so that every graph is used in the same way.
             rows: layout.history_steps.last().copied().unwrap_or(1),
             step_len: layout.step_len(),
+            action: layout.action,
         }
     }
 
     fn width(&self) -> usize {
-        self.step_len + ACTION + 1
+        self.step_len + self.action.numbers() + 1
     }
 
     fn shape(&self) -> [Length; 3] {
@@ -164,7 +167,7 @@ fn inputs(graph: &mut Graph, history: &History) {
         "velocity",
         Number::F32,
         &[Length::Batch, Length::Fixed(3)],
-        "forward, left, up in the corridor's frame, m/s",
+        "forward, left, up in the heading frame, m/s",
     );
     graph.input(
         "history",
@@ -178,8 +181,11 @@ fn outputs(graph: &mut Graph, history: &History) {
     graph.output(
         "action",
         Number::F32,
-        &[Length::Batch, Length::Fixed(ACTION)],
-        "velocity to command left and up, m/s, in [-1, 1]",
+        &[Length::Batch, Length::Fixed(history.action.numbers())],
+        &format!(
+            "{}, each in [-1, 1]: skein.action_limits",
+            history.action.axis_names()
+        ),
     );
     graph.output(
         "next_history",
@@ -210,7 +216,7 @@ fn encode(graph: &mut Graph) {
 
 /// `latent`, `velocity` and `history` to `present` and `observation`.
 fn remember(graph: &mut Graph, config: &Config, history: &History) {
-    let step_len = history.step_len;
+    let (step_len, action) = (history.step_len, history.action.numbers());
     graph.index("newest_row", 0);
     graph.node(
         "Gather",
@@ -218,7 +224,7 @@ fn remember(graph: &mut Graph, config: &Config, history: &History) {
         "newest",
         &[Attribute::Int("axis", 1)],
     );
-    graph.slice("newest", "mark", 1, step_len + ACTION..history.width());
+    graph.slice("newest", "mark", 1, step_len + action..history.width());
     graph.constant("half", &[], &[0.5]);
     graph.node("Less", &["mark", "half"], "is_reset", &[]);
     graph.axes("second", 1);
@@ -226,11 +232,12 @@ fn remember(graph: &mut Graph, config: &Config, history: &History) {
 
     let mut parts = vec!["latent"];
     if config.learning.observation != Observation::Latent {
-        graph.slice("velocity", "sideways", 1, 1..3);
-        parts.push("sideways");
+        let seen = config.observation_layout().velocity_len();
+        graph.slice("velocity", "own_velocity", 1, 3 - seen..3);
+        parts.push("own_velocity");
     }
     if config.learning.observation == Observation::LatentVelocityAction {
-        graph.slice("newest", "previous_action", 1, step_len..step_len + ACTION);
+        graph.slice("newest", "previous_action", 1, step_len..step_len + action);
         parts.push("previous_action");
     }
     graph.node("Concat", &parts, "present", &[Attribute::Int("axis", 1)]);
@@ -260,7 +267,7 @@ fn remember(graph: &mut Graph, config: &Config, history: &History) {
 }
 
 /// `observation` to `action`, without exploration.
-fn act(graph: &mut Graph, head: PolicyHead) {
+fn act(graph: &mut Graph, head: PolicyHead, action: ActionSpace) {
     let mut input = "observation".to_owned();
     for layer in 1..POLICY_LAYERS {
         let (weighted, output) = (format!("weighted{layer}"), format!("hidden{layer}"));
@@ -272,7 +279,7 @@ fn act(graph: &mut Graph, head: PolicyHead) {
     match head {
         PolicyHead::SquashedGaussian => {
             linear(graph, &input, &name, "distribution");
-            graph.slice("distribution", "mean", 1, 0..ACTION);
+            graph.slice("distribution", "mean", 1, 0..action.numbers());
         }
         PolicyHead::Noisy(_) => linear(graph, &input, &name, "mean"),
     }
@@ -334,6 +341,8 @@ fn metadata(
             "skein.history",
             format!("[batch, {}, {}]", history.rows, history.width()),
         ),
+        ("skein.action", history.action.name().to_owned()),
+        ("skein.action_limits", action_limits(config)),
         (
             "skein.camera_range_m",
             or(setting("camera", "range_m"), "20.0"),
@@ -352,6 +361,21 @@ fn metadata(
         value,
     };
     entries.into_iter().map(entry).collect()
+}
+
+/// Returns what the numbers of an action command at -1, 0 and 1: `forward: -1 to 0 to 3 m/s, …`.
+fn action_limits(config: &Config) -> String {
+    let max_speed = || config.simulator.get("vehicle")?.get("max_speed_mps");
+    let max_speed = max_speed().and_then(|speed| {
+        let whole = || speed.as_integer().map(|whole| whole as f64);
+        speed.as_float().or_else(whole)
+    });
+    let max_speed = max_speed.unwrap_or(1.0);
+    let axes = config.action_space().axes().iter().map(|axis| {
+        let [least, most] = axis.limits(max_speed as f32);
+        format!("{}: {least} to 0 to {most} {}", axis.name(), axis.unit())
+    });
+    axes.collect::<Vec<_>>().join(", ")
 }
 
 fn layout_text(config: &Config) -> String {

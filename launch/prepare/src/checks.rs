@@ -66,7 +66,7 @@ pub fn check(
     check_level_count(
         config_file,
         config,
-        Course::load(&config.courses.training)?.walls().len(),
+        Course::load(&config.courses.training)?.levels().into(),
         &config.courses.training.display(),
     )?;
     let trains_on_generated = config.courses.generated_share > 0.0;

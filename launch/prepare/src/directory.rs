@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use skein_protocol::config::{Config, CoursesSection};
 use skein_run::RunDirectory;
+use skein_simulator::course::Course;
 
 use super::PrepareError;
 
@@ -106,10 +107,33 @@ pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), Prepar
             name = format!("{stem}_{number}.toml").into();
         }
         copy(path, folder.join(&name))?;
+        copy_meshes(path, &folder)?;
         let relative = Path::new("courses").join(&name);
         copies.insert(name, std::mem::replace(path, relative));
     }
     Ok(())
+}
+
+/// Copies the mesh files that the course file `path` names.
+fn copy_meshes(path: &Path, folder: &Path) -> Result<(), PrepareError> {
+    for file in Course::mesh_files(path)? {
+        let from = path.parent().unwrap_or(Path::new("")).join(&file);
+        let to = folder.join(&file);
+        let is_name = file.file_name() == Some(file.as_os_str());
+        let is_new = || !to.exists() || same_bytes(&from, &to);
+        if !is_name || !is_new() {
+            return Err(PrepareError::MeshFile {
+                course: path.to_owned(),
+                file,
+            });
+        }
+        copy(&from, to)?;
+    }
+    Ok(())
+}
+
+fn same_bytes(one: &Path, other: &Path) -> bool {
+    matches!((fs::read(one), fs::read(other)), (Ok(one), Ok(other)) if one == other)
 }
 
 /// Copies a file, for the user only.

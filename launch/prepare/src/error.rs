@@ -30,6 +30,18 @@ pub enum PrepareError {
     /// A course cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
+    /// A mesh file that a run cannot keep a copy of under its name.
+    #[error(
+        "{}: file = {file:?}: a run keeps copies of all mesh files in one folder: put the file beside \
+         the course, under a name that no other course of the run uses for another mesh",
+        course.display()
+    )]
+    MeshFile {
+        /// The course file.
+        course: PathBuf,
+        /// The mesh file, as the course names it.
+        file: PathBuf,
+    },
     /// A vehicle or camera setting is invalid.
     #[error("{}: {source}", config.display())]
     Settings {

@@ -8,7 +8,7 @@ use rustix::fs::statvfs;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use skein_protocol::config::{Config, CriticInput, EncoderTraining};
 use skein_protocol::snapshot::SnapshotLayout;
-use skein_protocol::{ACTION, CRITIC_STATE, IMAGE_PIXELS};
+use skein_protocol::{IMAGE_PIXELS, critic_state};
 use skein_run::allocation::{MemoryLimit, memory_limit};
 use skein_transport::shared_memory_needed;
 
@@ -299,16 +299,14 @@ fn checkpoint_bytes(config: &Config) -> u64 {
     let records =
         (config.transport.max_records_per_episode * learning.copies_per_transition()) as u64;
     let rows = (config.replay.capacity as u64).min(config.run.episodes.saturating_mul(records));
+    let action = config.action_space();
     let message = match learning.critic_input {
         CriticInput::Observation => 0,
-        CriticInput::GroundTruth => CRITIC_STATE,
+        CriticInput::GroundTruth => critic_state(action),
     };
-    let teacher_action = match config.teacher.is_configured() {
-        true => ACTION,
-        false => 0,
-    };
+    let actions = action.numbers() * (1 + usize::from(config.teacher.is_configured()));
     let step = config.observation_layout().len() + message;
-    let row = 4 * (2 * step + ACTION + teacher_action + 2) as u64;
+    let row = 4 * (2 * step + actions + 2) as u64;
     let steps = match learning.encoder {
         EncoderTraining::Vae => config.vae.train_steps * learning.copies_per_transition(),
         EncoderTraining::EndToEnd => config.replay.capacity,

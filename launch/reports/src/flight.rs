@@ -12,6 +12,7 @@ use skein_simulator::course::{Course, DRONE_WIDTH_M, Wall};
 
 use super::ReportError;
 use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px, replace_picture};
+use super::obstacles::draw_obstacles;
 use super::trajectories::{CORRIDOR, WALL, open_in_cut_m};
 
 const WIDTH: u32 = 640;
@@ -168,6 +169,7 @@ impl<'a> Stage<'a> {
         let range_m = self.range_m(axis);
         let frame = self.rectangle(axis, length_m, range_m);
         area.draw(&Rectangle::new(frame, CORRIDOR.filled()))?;
+        draw_obstacles(area, self.course, axis, |point| self.at(axis, point))?;
         for wall in self.course.walls() {
             self.draw_wall(area, axis, wall)?;
         }
@@ -204,8 +206,12 @@ impl<'a> Stage<'a> {
             return Ok(());
         };
         canvas.draw(|area| {
-            let walls = self.course.walls().len();
-            let title = format!("{title}: {} of {walls} walls passed", now.walls_passed);
+            let (passed, all) = (now.walls_passed, self.course.levels());
+            let what = match self.course.is_world() {
+                true => "stages",
+                false => "walls",
+            };
+            let title = format!("{title}: {passed} of {all} {what} passed");
             area.draw_text(&title, &font(17), drawn(LEFT, 8))?;
             for axis in [0, 1] {
                 let way = steps.iter().map(|step| self.at(axis, step.position_m));

@@ -13,6 +13,7 @@ pub mod flight;
 mod front_views;
 pub mod growth;
 mod head;
+mod obstacles;
 mod reconstructions;
 mod trajectories;
 

@@ -12,6 +12,7 @@ use super::ReportError;
 use super::canvas::{Area, Canvas, INK, REFERENCE, STRONG, font, px};
 use super::complete_rows::{TornRow, complete_rows};
 use super::front_views::FrontViews;
+use super::obstacles::draw_obstacles;
 use crate::NamedCourse;
 
 /// Most trajectories drawn of one course: more would only cover each other.
@@ -34,8 +35,9 @@ const HIGHEST_PANEL: u32 = 600;
 
 pub(super) const CORRIDOR: RGBColor = RGBColor(0xf3, 0xf5, 0xf8);
 pub(super) const WALL: RGBColor = RGBColor(0x4a, 0x50, 0x5a);
-/// Part of a wall that is open, but not in the cut through the opening's middle.
-const PARTLY_OPEN: RGBColor = RGBColor(0xb4, 0xb8, 0xc0);
+/// Part of a wall that is open, but not in the cut through the opening's middle; an obstacle above,
+/// below or beside the cut.
+pub(super) const PARTLY_OPEN: RGBColor = RGBColor(0xb4, 0xb8, 0xc0);
 const TIMED_OUT: RGBColor = RGBColor(0x8a, 0x5f, 0xb5);
 
 /// Trajectory of one evaluation episode.
@@ -294,6 +296,9 @@ impl Panel<'_> {
             self.rectangle((0.0, length_m), (low, high)),
             CORRIDOR.filled(),
         ))?;
+        draw_obstacles(area, self.course, self.view.axis(), |point| {
+            self.at(point[0], self.view.across_m(point))
+        })?;
         // Failed episodes are drawn last, over the others: readers look for them.
         let (well, wrong): (Vec<_>, Vec<_>) = episodes
             .iter()
@@ -486,7 +491,7 @@ fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
         ("collided", REFERENCE),
         ("timed out", TIMED_OUT),
         ("walls", WALL),
-        ("partly open: see the wall's front", PARTLY_OPEN),
+        ("partly open: see the wall's front; obstacles", PARTLY_OPEN),
     ] {
         area.draw(&PathElement::new(
             [(x, y), (x + px(26) as i32, y)],

@@ -338,10 +338,11 @@ function wayOf(points, upto) {
   return { x: way.map((p) => p[0]), y: way.map((p) => p[1]), z: way.map((p) => p[2]) };
 }
 
-// A plot of a flight through walls. Its move(step) flies the drone to a step.
-function scene(corridor, walls, points, outcome, name) {
+// A plot of a flight through walls and obstacles. Its move(step) flies the drone to a step.
+function scene({ corridor_m: corridor, walls: closed, obstacles_m: obstacles }, points, outcome, name) {
   const colours = { color: OUTCOMES[outcome] };
   const last = points.length - 1;
+  const walls = obstacles.length > 0 ? [...closed, { triangles_m: obstacles }] : closed;
   const plot = element("div", { class: "plot" });
   const at = (step) => wayOf([points[step]], 0);
   const line = (more, upto) => Object.assign({ type: "scatter3d", mode: "lines", line: Object.assign({ width: 6 }, colours) }, more, wayOf(points, upto));
@@ -417,7 +418,7 @@ async function evaluationFlight(choices) {
   const flight = course.flights[state.flight];
   const options = course.flights.map((one, number) => [`${number}`, `${one.episode}: ${OUTCOME_NAMES[one.outcome]}`]);
   const chosen = select("Episode", options, `${state.flight}`, (value) => { state.flight = Number(value); show(); });
-  const drawn = scene(course.corridor_m, course.walls, flight.points_m, flight.outcome, `episode ${flight.episode}`);
+  const drawn = scene(course, flight.points_m, flight.outcome, `episode ${flight.episode}`);
   const where = element("output", {});
   const say = (step) => { where.textContent = ` step ${step} of ${drawn.last}: ${place(flight.points_m[step])}`; };
   const controls = player(drawn.last, (step) => { drawn.move(step); say(step); });
@@ -472,7 +473,7 @@ function rewardPlot(steps) {
 }
 
 // Numbers of a step that a table shows: column, its title.
-const SHOWN = [["position_m", "position, m"], ["velocity_mps", "velocity, m/s"], ["action", "action: left, up"],
+const SHOWN = [["position_m", "position, m"], ["velocity_mps", "velocity, m/s"], ["action", "action"],
   ["oracle_action", "teacher's action"], ["reward_terms", "reward terms"], ["walls_passed", "walls passed"]];
 
 function numbersTable(flight, step) {
@@ -516,7 +517,7 @@ async function recordedFlight(kept, id, recordings, source) {
   choices.push(element("label", {}, follow, " follow the newest"));
 
   const points = flight.steps.map((step) => step.numbers.position_m);
-  const drawn = scene(flight.corridor_m, flight.walls, points, outcomeOf(flight), flight.title);
+  const drawn = scene(flight, points, outcomeOf(flight), flight.title);
   const [seen, coded] = [picture("depth image: brighter is farther"), picture("what the decoder makes of its latent code")];
   const rewards = rewardPlot(flight.steps);
   const where = element("output", {});

@@ -20,6 +20,8 @@ pub(crate) struct FlownCourse {
     /// Length, width, height.
     corridor_m: [f32; 3],
     walls: Vec<WallShape>,
+    /// Triangles of the obstacles of a world that stand still.
+    obstacles_m: Vec<[[f32; 3]; 3]>,
     /// Number of all episodes.
     episodes: usize,
     failed: usize,
@@ -127,6 +129,7 @@ fn of_course(course: &Course, flights: &[Flight]) -> FlownCourse {
         name: course.name().to_owned(),
         corridor_m: [corridor.length_m, corridor.width_m, corridor.height_m],
         walls: walls.map(shape).collect(),
+        obstacles_m: course.obstacle_triangles(),
         episodes: flights.len(),
         failed: failed.len(),
         flights: failed

@@ -2,10 +2,12 @@
 
 use skein_learner::algorithm::Columns;
 use skein_learner::noise::Noise;
-use skein_protocol::ACTION;
 
 /// Width of an observation, as in `one-course.toml`.
 pub(crate) const OBSERVATION: usize = 34;
+
+/// Numbers of a lateral action.
+pub(crate) const ACTION: usize = 2;
 
 /// A minibatch of random numbers.
 pub(crate) struct Transitions {

@@ -36,14 +36,14 @@ fn the_policy_learns_the_teachers_actions_and_keeps_its_exploration() {
         let (first, last) = (distances[0], distances[distances.len() - 1]);
         assert!(last < 0.05 * first, "seed {seed}: {first} to {last}");
         let seen = Transitions::one_step_task(OBSERVATION, 32, &mut Noise::new(9));
-        let mut outputs = vec![0.0; 32 * 2 * ACTION];
+        let mut outputs = vec![0.0; 32 * 4];
         let parameters = &distill.parameters.values;
         let team = &mut Team::new(1);
         distill
             .policy
             .forward_through(team, parameters, &seen.observations, &mut outputs);
-        for output in outputs.chunks_exact(2 * ACTION) {
-            for log_std in &output[ACTION..] {
+        for output in outputs.chunks_exact(4) {
+            for log_std in &output[2..] {
                 assert!((LOG_STD.0..=LOG_STD.1).contains(log_std));
                 assert!((log_std.exp() - 0.25).abs() < 0.05, "{log_std}");
             }

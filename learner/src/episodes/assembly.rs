@@ -5,8 +5,10 @@
 //! each segment, and each begins where the one before it ended.
 
 use skein_protocol::ids::{ActorId, ActorIncarnation, EpisodeId};
-use skein_protocol::transition::{Outcome, RecordFault, RecordKind, TransitionRecord};
-use skein_protocol::{ACTION, IMAGE_PIXELS};
+use skein_protocol::transition::{
+    Outcome, RecordFault, RecordKind, RecordLengths, TransitionRecord,
+};
+use skein_protocol::{Action, IMAGE_PIXELS};
 
 use super::order::EpisodeOrder;
 use crate::episode::{CommittedEpisode, StepObservation};
@@ -23,7 +25,7 @@ pub struct Assembly {
     /// Required start of a later segment: the end of the one before it.
     begins: Option<SegmentEnd>,
     longest_records: usize,
-    latent: usize,
+    lengths: RecordLengths,
     /// State of the episode after the last step; its walls passed are in `episode`.
     last_step: StepEnd,
 }
@@ -87,13 +89,13 @@ pub enum Assembled {
 }
 
 impl Assembly {
-    /// Starts empty, for `order`. An episode has at most `longest_records` records, with codes of
-    /// `latent` numbers. A later segment `begins` at the end of the one before it.
+    /// Starts empty, for `order`. An episode has at most `longest_records` records, with codes and
+    /// actions of these `lengths`. A later segment `begins` at the end of the one before it.
     pub fn new(
         order: EpisodeOrder,
         begins: Option<SegmentEnd>,
         longest_records: usize,
-        latent: usize,
+        lengths: RecordLengths,
         actor: ActorId,
         incarnation: ActorIncarnation,
     ) -> Self {
@@ -107,7 +109,7 @@ impl Assembly {
             incarnation,
             begins,
             longest_records,
-            latent,
+            lengths,
             last_step: StepEnd::Onward,
         }
     }
@@ -143,7 +145,7 @@ impl Assembly {
         if kind == RecordKind::Failed {
             return Ok(Assembled::Failed);
         }
-        record.check_latent(self.latent)?;
+        record.check_lengths(self.lengths)?;
         if self.episode.observations.len() == self.longest_records {
             let most = self.longest_records;
             return Err(RecordFault::TooLong { most });
@@ -328,7 +330,7 @@ impl Assembly {
 /// The episode or segment that `order` asks for, before its first record.
 fn nothing_of(order: &EpisodeOrder, actor: ActorId) -> CommittedEpisode {
     let ticket = &order.ticket;
-    let flown: &[[f32; ACTION]] = ticket
+    let flown: &[Action] = ticket
         .segment
         .as_ref()
         .map_or(&[], |segment| &segment.prior_actions);

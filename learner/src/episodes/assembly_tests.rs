@@ -1,6 +1,7 @@
 //! An episode or a segment is whole, in order and consistent, or it is refused with the reason.
 
 use bytemuck::Zeroable;
+use skein_protocol::ActionSpace;
 use skein_protocol::ids::{Attempt, Epoch, PolicyVersion, RunId};
 use skein_protocol::segment::Segment;
 use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
@@ -12,6 +13,10 @@ const ACTOR: ActorId = ActorId(2);
 const INCARNATION: ActorIncarnation = ActorIncarnation(11);
 /// Length of the latent codes.
 const LATENT: usize = 16;
+const LENGTHS: RecordLengths = RecordLengths {
+    latent: LATENT,
+    action: ActionSpace::Lateral,
+};
 /// Steps of the test episode.
 const STEPS: u32 = 3;
 
@@ -44,7 +49,7 @@ fn assembly(keep: KeptData) -> Assembly {
         order(ticket(), keep),
         None,
         STEPS as usize + 1,
-        LATENT,
+        LENGTHS,
         ACTOR,
         INCARNATION,
     )
@@ -135,7 +140,7 @@ fn an_episode_that_never_ends_is_refused_at_its_limit() {
 fn segment(begins: Option<SegmentEnd>) -> Assembly {
     let segment = Segment {
         steps: 2,
-        prior_actions: vec![[0.25, -0.5]].into(),
+        prior_actions: vec![[0.25, -0.5, 0.0, 0.0]].into(),
     };
     let ticket = Ticket {
         segment: Some(segment),
@@ -145,7 +150,7 @@ fn segment(begins: Option<SegmentEnd>) -> Assembly {
         order(ticket, KeptData::Depth),
         begins,
         100,
-        LATENT,
+        LENGTHS,
         ACTOR,
         INCARNATION,
     )
@@ -186,7 +191,7 @@ fn a_segment_holds_its_steps_and_the_action_before_them() {
     );
     assert_eq!(
         (segment.action_before, segment.check()),
-        ([0.25, -0.5], Ok(()))
+        ([0.25, -0.5, 0.0, 0.0], Ok(()))
     );
     assert!(!segment.terminated());
     let end = SegmentEnd::of(&segment).unwrap();

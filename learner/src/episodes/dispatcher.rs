@@ -17,7 +17,7 @@ use skein_protocol::ids::{ActorId, ActorIncarnation, Attempt, EpisodeId, RunId};
 use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus};
 use skein_protocol::ticket::{ControlMessage, ControlRecord, Ticket};
-use skein_protocol::transition::{RecordFault, TransitionRecord};
+use skein_protocol::transition::{RecordFault, RecordLengths, TransitionRecord};
 
 use super::assembly::{Assembled, Assembly, SegmentEnd};
 use super::failures::EpisodeFailures;
@@ -36,8 +36,8 @@ const MOST_SPOILED: u32 = 3;
 pub struct Dispatcher {
     run: RunId,
     limits: TransportSection,
-    /// Length of the latent codes that actors send.
-    latent: usize,
+    /// Lengths of what actors send.
+    lengths: RecordLengths,
     /// Orders without an actor, in the order to fly them.
     waiting: VecDeque<EpisodeOrder>,
     actors: BTreeMap<ActorId, AttachedActor>,
@@ -96,12 +96,13 @@ impl IssuedTicket {
 }
 
 impl Dispatcher {
-    /// Starts without orders and actors of `run`; records hold codes of `latent` numbers.
-    pub fn new(run: RunId, limits: &TransportSection, latent: usize) -> Self {
+    /// Starts without orders and actors of `run`; records hold codes and actions of
+    /// these `lengths`.
+    pub fn new(run: RunId, limits: &TransportSection, lengths: RecordLengths) -> Self {
         Self {
             run,
             limits: limits.clone(),
-            latent,
+            lengths,
             waiting: VecDeque::new(),
             actors: BTreeMap::new(),
             failures: EpisodeFailures::default(),
@@ -411,7 +412,7 @@ impl Dispatcher {
             let begins = self.segment_end.filter(|end| end.is_before(&order));
             let longest = self.limits.max_records_per_episode;
             let assembly =
-                Assembly::new(order, begins, longest, self.latent, id, actor.incarnation);
+                Assembly::new(order, begins, longest, self.lengths, id, actor.incarnation);
             self.is_wake_due |= actor.may_wait || actor.tickets.is_empty();
             actor.tickets.push_back(IssuedTicket {
                 since: now,

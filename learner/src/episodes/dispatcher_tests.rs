@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use bytemuck::Zeroable;
 use proptest::prelude::*;
+use skein_protocol::ActionSpace;
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::{Control, CourseChoice, Exploration};
@@ -16,6 +17,10 @@ use super::*;
 
 pub(super) const RUN: RunId = RunId(1);
 pub(super) const INCARNATION: ActorIncarnation = ActorIncarnation(100);
+pub(super) const LENGTHS: RecordLengths = RecordLengths {
+    latent: 32,
+    action: ActionSpace::Lateral,
+};
 
 pub(super) fn limits() -> TransportSection {
     TransportSection {
@@ -142,7 +147,7 @@ pub(super) fn feed(
 
 /// Returns a dispatcher with one actor that holds tickets 0 and 1 of three orders.
 pub(super) fn dispatcher(now: Instant) -> (Dispatcher, Vec<Ticket>) {
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     (0..3).for_each(|episode| dispatcher.order(order(episode)));
     attach(&mut dispatcher, 0, INCARNATION, now);
     let tickets = tickets_for(&dispatcher.issue(now), 0, INCARNATION);
@@ -174,7 +179,7 @@ fn credit_bounds_outstanding_tickets_and_returns_with_each_episode() {
 #[test]
 fn every_actor_gets_its_first_ticket_before_any_its_second() {
     let now = Instant::now();
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     (0..3).for_each(|episode| dispatcher.order(order(episode)));
     attach(&mut dispatcher, 0, INCARNATION, now);
     attach(&mut dispatcher, 1, INCARNATION, now);
@@ -338,7 +343,7 @@ fn an_episode_that_the_only_actor_always_fails_is_given_up_with_the_reason() {
 #[test]
 fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
     let now = Instant::now();
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     (0..6).for_each(|episode| dispatcher.order(order(episode)));
     attach(&mut dispatcher, 0, INCARNATION, now);
     dispatcher.issue(now);
@@ -361,7 +366,7 @@ fn an_actor_that_sends_garbage_for_ever_fails_no_run_while_another_flies() {
 #[test]
 fn an_episode_that_two_actors_fail_is_given_up() {
     let now = Instant::now();
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     dispatcher.order(order(0));
     attach(&mut dispatcher, 0, INCARNATION, now);
     dispatcher.issue(now);
@@ -396,7 +401,7 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
             max_actors: 2,
             ..limits()
         },
-        32,
+        LENGTHS,
     );
     (0..3).for_each(|actor| attach(&mut dispatcher, actor, INCARNATION, start));
     assert_eq!(dispatcher.actors().count(), 2);
@@ -445,7 +450,7 @@ proptest! {
     ) {
         const ORDERS: u64 = 12;
         let mut now = Instant::now();
-        let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+        let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
         (0..ORDERS).for_each(|episode| dispatcher.order(order(episode)));
         let mut incarnations = [INCARNATION; 3];
         let mut held: [VecDeque<Ticket>; 3] = Default::default();
@@ -521,7 +526,7 @@ proptest! {
 #[test]
 fn the_times_of_all_incarnations_of_all_actors_are_summed_without_counting_twice() {
     let now = Instant::now();
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     let flies = |dispatcher: &mut Dispatcher, actor, incarnation, secs| {
         flown(
             dispatcher,

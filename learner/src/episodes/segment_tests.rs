@@ -3,10 +3,11 @@
 
 use std::time::{Duration, Instant};
 
+use skein_protocol::MAX_ACTION;
 use skein_protocol::segment::Segment;
 use skein_protocol::transition::RecordKind;
 
-use super::tests::{INCARNATION, RUN, attach, feed, limits, order, records, tickets_for};
+use super::tests::{INCARNATION, LENGTHS, RUN, attach, feed, limits, order, records, tickets_for};
 use super::*;
 
 /// Order of the one-step segment of episode 0 that follows `flown` steps.
@@ -14,7 +15,7 @@ fn segment(flown: usize) -> EpisodeOrder {
     let mut order = order(0);
     order.ticket.segment = Some(Segment {
         steps: 1,
-        prior_actions: vec![[0.0, 0.0]; flown].into(),
+        prior_actions: vec![[0.0; MAX_ACTION]; flown].into(),
     });
     order.place.batch = flown as u64;
     order
@@ -37,7 +38,7 @@ fn flown(ticket: &Ticket, actor: u32, x_m: f32) -> [TransitionRecord; 2] {
 /// Returns a dispatcher whose first segment actor 0 of two has flown, from 0 m to 1 m. The ticket
 /// of the second is issued to it.
 fn dispatcher(now: Instant) -> (Dispatcher, Ticket) {
-    let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+    let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
     attach(&mut dispatcher, 0, INCARNATION, now);
     attach(&mut dispatcher, 1, INCARNATION, now);
     dispatcher.order(segment(0));

@@ -86,7 +86,7 @@ impl Server {
     pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
         Self {
             run: identity.run,
-            dispatcher: Dispatcher::new(identity.run, &config.transport, config.vae.latent),
+            dispatcher: Dispatcher::new(identity.run, &config.transport, config.record_lengths()),
             deliveries: BTreeMap::new(),
             ports,
             outbox: VecDeque::new(),

@@ -6,7 +6,7 @@ use std::time::Instant;
 use proptest::prelude::*;
 
 use super::tests::{
-    INCARNATION, RUN, attach, dispatcher, feed, limits, order, records, tickets_for,
+    INCARNATION, LENGTHS, RUN, attach, dispatcher, feed, limits, order, records, tickets_for,
 };
 use super::*;
 
@@ -88,7 +88,7 @@ struct Simulation {
 
 impl Simulation {
     fn new(episodes: u64) -> Self {
-        let mut dispatcher = Dispatcher::new(RUN, &limits(), 32);
+        let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
         (0..episodes).for_each(|episode| dispatcher.order(order(episode)));
         let mut actors = vec![
             SimulatedActor::default(),

@@ -1,9 +1,9 @@
 //! The critic: estimates the value of an action in a state, twice.
 
-use skein_protocol::ACTION;
 use tch::Tensor;
 
 use super::{Layout, LinearLayer, Parameters};
+use crate::algorithm::Inputs;
 
 /// Three fully connected layers with ReLU between. Either one network whose last layer gives two
 /// estimates of Q (the paper, section 3.4), or two networks with one estimate each
@@ -17,7 +17,7 @@ impl CriticNetwork {
     /// Describes the layers of `networks`, one or two.
     pub fn describe(
         layout: &mut Layout,
-        observation: i64,
+        inputs: Inputs,
         hidden_width: i64,
         networks: usize,
     ) -> Self {
@@ -26,7 +26,11 @@ impl CriticNetwork {
                 LinearLayer::describe(layout, &format!("{name}.layer{number}"), inputs, outputs)
             };
             [
-                layer(1, observation + ACTION as i64, hidden_width),
+                layer(
+                    1,
+                    (inputs.critic + inputs.action.numbers()) as i64,
+                    hidden_width,
+                ),
                 layer(2, hidden_width, hidden_width),
                 layer(3, hidden_width, 2 / networks as i64),
             ]
@@ -39,7 +43,7 @@ impl CriticNetwork {
     }
 
     /// Returns both estimates of Q, `[n, 2]`. `observations`: `[n, observation]`, `actions`:
-    /// `[n, 2]`.
+    /// `[n, action]`.
     pub fn forward(
         &self,
         parameters: &Parameters,

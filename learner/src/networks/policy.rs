@@ -2,10 +2,11 @@
 
 use std::f64::consts::{LN_2, PI};
 
-use skein_protocol::{ACTION, LOG_STD};
+use skein_protocol::LOG_STD;
 use tch::Tensor;
 
 use super::{Layout, LinearLayer, Parameters};
+use crate::algorithm::Inputs;
 
 /// Four fully connected layers with ReLU between (the paper, section 3.4). The last one gives mean
 /// and log standard deviation of a Gaussian, which tanh squashes into the action (arXiv:1812.05905,
@@ -18,7 +19,7 @@ pub struct PolicyNetwork {
 /// Actions drawn from the policy.
 #[derive(Debug)]
 pub struct PolicySample {
-    /// Actions, `[n, 2]`, inside (-1, 1).
+    /// Actions, `[n, action]`, inside (-1, 1).
     pub actions: Tensor,
     /// log π(action | observation) in nats, `[n]`.
     pub log_prob: Tensor,
@@ -27,26 +28,26 @@ pub struct PolicySample {
 impl PolicyNetwork {
     /// Describes the layers of a stochastic policy: its outputs are means and log standard
     /// deviations.
-    pub fn describe(layout: &mut Layout, observation: i64, hidden_width: i64) -> Self {
-        Self::with_outputs(layout, observation, hidden_width, 2 * ACTION as i64)
+    pub fn describe(layout: &mut Layout, inputs: Inputs, hidden_width: i64) -> Self {
+        Self::with_outputs(layout, inputs, hidden_width, 2 * inputs.action.numbers())
     }
 
     /// Describes the layers of a policy with `outputs` outputs, such as the action alone.
     pub fn with_outputs(
         layout: &mut Layout,
-        observation: i64,
+        inputs: Inputs,
         hidden_width: i64,
-        outputs: i64,
+        outputs: usize,
     ) -> Self {
         let mut layer = |number: usize, inputs: i64, outputs: i64| {
             LinearLayer::describe(layout, &format!("policy.layer{number}"), inputs, outputs)
         };
         Self {
             layers: [
-                layer(1, observation, hidden_width),
+                layer(1, inputs.policy as i64, hidden_width),
                 layer(2, hidden_width, hidden_width),
                 layer(3, hidden_width, hidden_width),
-                layer(4, hidden_width, outputs),
+                layer(4, hidden_width, outputs as i64),
             ],
         }
     }
@@ -61,12 +62,13 @@ impl PolicyNetwork {
         last.forward(parameters, &features)
     }
 
-    /// Returns mean and log standard deviation before tanh, `[n, 2]` each.
+    /// Returns mean and log standard deviation before tanh, `[n, action]` each.
     pub fn distribution(&self, parameters: &Parameters, observations: &Tensor) -> (Tensor, Tensor) {
         let output = self.output(parameters, observations);
+        let action = output.size()[1] / 2;
         let (mean, log_std) = (
-            output.narrow(1, 0, ACTION as i64),
-            output.narrow(1, ACTION as i64, ACTION as i64),
+            output.narrow(1, 0, action),
+            output.narrow(1, action, action),
         );
         (
             mean,
@@ -74,12 +76,13 @@ impl PolicyNetwork {
         )
     }
 
-    /// Returns the action without noise, tanh of the mean, `[n, 2]`.
+    /// Returns the action without noise, tanh of the mean, `[n, action]`.
     pub fn mode(&self, parameters: &Parameters, observations: &Tensor) -> Tensor {
         self.distribution(parameters, observations).0.tanh()
     }
 
-    /// Draws actions, differentiably in the parameters. `noise`: standard normal, `[n, 2]`.
+    /// Draws actions, differentiably in the parameters. `noise`: standard normal,
+    /// `[n, action]`.
     pub fn sample(
         &self,
         parameters: &Parameters,

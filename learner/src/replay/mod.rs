@@ -26,7 +26,7 @@ use std::sync::Arc;
 use rand::{Rng, RngExt};
 use skein_protocol::config::{Config, EncoderTraining, ObservationLayout, ReplaySection};
 use skein_protocol::ids::EpisodeId;
-use skein_protocol::{ACTION, IMAGE_PIXELS, LatentCode};
+use skein_protocol::{Action, IMAGE_PIXELS, LatentCode};
 
 use crate::episode::{CommittedEpisode, MalformedEpisode};
 use images::ImageStore;
@@ -61,15 +61,15 @@ pub struct Replay {
 pub struct Minibatch {
     /// Observations before the action, `[batch, observation]`.
     pub observations: Vec<f32>,
-    /// Actions, `[batch, 2]`.
+    /// Actions, `[batch, action]`.
     pub actions: Vec<f32>,
-    /// The teacher's actions, `[batch, 2]`; empty without a teacher.
+    /// The teacher's actions, `[batch, action]`; empty without a teacher.
     pub teacher_actions: Vec<f32>,
     /// Rewards, `[batch]`.
     pub rewards: Vec<f32>,
     /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// Critic inputs before the action, `[batch, CRITIC_STATE]`; empty if the critic sees the
+    /// Critic inputs before the action, `[batch, critic_state(action)]`; empty if the critic sees the
     /// observation.
     pub critic_states: Vec<f32>,
     /// Critic inputs after the action, likewise.
@@ -189,12 +189,12 @@ impl Replay {
             let row = ring.claim(first_image.map(|first| first + step as u32));
             episode.write_observation(step, &self.view, row.observation);
             episode.write_observation(step + 1, &self.view, row.next_observation);
-            episode.write_critic_state(step, row.critic_state);
-            episode.write_critic_state(step + 1, row.next_true_state);
-            row.action.copy_from_slice(&episode.actions[step]);
-            let teacher = &episode.teacher_actions[step];
-            row.teacher_action
-                .copy_from_slice(&teacher[..row.teacher_action.len()]);
+            let action = self.view.action;
+            episode.write_critic_state(step, action, row.critic_state);
+            episode.write_critic_state(step + 1, action, row.next_true_state);
+            let copy = |into: &mut [f32], from: &Action| into.copy_from_slice(&from[..into.len()]);
+            copy(row.action, &episode.actions[step]);
+            copy(row.teacher_action, &episode.teacher_actions[step]);
             *row.reward = episode.rewards[step];
             *row.terminated = f32::from(step == last && episode.terminated());
         }
@@ -357,7 +357,6 @@ impl Minibatch {
         self.slots.clear();
         self.slots
             .extend((0..count).map(|_| rng.random_range(0..ring.len())));
-        self.actions.reserve(count * ACTION);
         for &slot in &self.slots {
             let row = ring.row(slot);
             self.observations.extend_from_slice(row.observation);

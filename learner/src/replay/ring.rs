@@ -5,7 +5,7 @@
 //! cache lines, where one table per quantity would cost one miss each.
 
 use skein_protocol::config::{Config, CriticInput, ObservationLayout};
-use skein_protocol::{ACTION, CRITIC_STATE, LatentCode};
+use skein_protocol::{LatentCode, critic_state};
 
 /// Layout of a row: observation, next observation, true state, next true state, action, teacher's
 /// action, reward, terminated, all `f32`.
@@ -15,6 +15,8 @@ pub(super) struct RowLayout {
     pub(super) observation: usize,
     /// Length of the critic's own input; 0 if the critic sees the observation.
     pub(super) critic_state: usize,
+    /// Numbers of an action.
+    pub(super) action: usize,
     /// Length of the teacher's action; 0 without a teacher.
     pub(super) teacher_action: usize,
 }
@@ -47,14 +49,16 @@ pub(super) struct TransitionRow<'a> {
 impl RowLayout {
     /// Returns the layout for the run that `config` describes.
     pub(super) fn of(config: &Config) -> Self {
+        let action = config.action_space();
         Self {
             observation: config.observation_layout().len(),
             critic_state: match config.learning.critic_input {
                 CriticInput::Observation => 0,
-                CriticInput::GroundTruth => CRITIC_STATE,
+                CriticInput::GroundTruth => critic_state(action),
             },
+            action: action.numbers(),
             teacher_action: match config.teacher.is_configured() {
-                true => ACTION,
+                true => action.numbers(),
                 false => 0,
             },
         }
@@ -62,7 +66,7 @@ impl RowLayout {
 
     /// Number of values in a row.
     pub(super) fn width(self) -> usize {
-        2 * (self.observation + self.critic_state) + ACTION + self.teacher_action + 2
+        2 * (self.observation + self.critic_state) + self.action + self.teacher_action + 2
     }
 
     fn row(self, values: &[f32]) -> TransitionRow<'_> {
@@ -70,7 +74,7 @@ impl RowLayout {
         let (next_observation, rest) = rest.split_at(self.observation);
         let (critic_state, rest) = rest.split_at(self.critic_state);
         let (next_true_state, rest) = rest.split_at(self.critic_state);
-        let (action, rest) = rest.split_at(ACTION);
+        let (action, rest) = rest.split_at(self.action);
         let (teacher_action, rest) = rest.split_at(self.teacher_action);
         TransitionRow {
             observation,
@@ -89,7 +93,7 @@ impl RowLayout {
         let (next_observation, rest) = rest.split_at_mut(self.observation);
         let (critic_state, rest) = rest.split_at_mut(self.critic_state);
         let (next_true_state, rest) = rest.split_at_mut(self.critic_state);
-        let (action, rest) = rest.split_at_mut(ACTION);
+        let (action, rest) = rest.split_at_mut(self.action);
         let (teacher_action, rest) = rest.split_at_mut(self.teacher_action);
         let (reward, terminated) = rest.split_at_mut(1);
         TransitionRowMut {

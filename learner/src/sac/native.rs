@@ -15,7 +15,6 @@
 mod sample;
 
 use skein_kernels::{Isa, Team, exp};
-use skein_protocol::ACTION;
 use skein_protocol::config::{SacSection, TeacherSection};
 use skein_protocol::seeds::{Purpose, derive};
 
@@ -59,11 +58,11 @@ pub struct NativeSac {
 #[derive(Debug, Default)]
 struct UpdateBuffers {
     rows: usize,
-    /// Policy network outputs, `[2 rows, 4]`: first for the next observations s', then for s.
+    /// Policy network outputs, `[2 rows, 2 · action]`: first for the next observations s', then for s.
     outputs: Vec<f32>,
     /// Actions drawn from those outputs, and their log-probabilities: rows of s' first, then of s.
     sample: Sample,
-    /// Critic input, `[rows, critic input + 2]`: states and actions side by side.
+    /// Critic input, `[rows, critic input + action]`: states and actions side by side.
     joined: Vec<f32>,
     /// Target critic's two estimates of Q̄(s', a'), `[rows, 2]`.
     target_values: Vec<f32>,
@@ -75,7 +74,8 @@ struct UpdateBuffers {
     critic_grad: CriticLayers,
     /// Gradient of the policy loss with respect to the two estimates of Q(s, a), `[rows, 2]`.
     drawn_grad: Vec<f32>,
-    /// Gradient of the policy loss with respect to the drawn actions, through Q, `[rows, 2]`.
+    /// Gradient of the policy loss with respect to the drawn actions, through Q,
+    /// `[rows, action]`.
     action_grad: Vec<f32>,
     /// Policy activations for the current states s, `[rows, width]` per layer.
     policy: Layers,
@@ -91,16 +91,11 @@ impl NativeSac {
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, isa: Isa) -> Self {
         let width = section.hidden_width as i64;
         let mut policy_layout = Layout::default();
-        PolicyNetwork::describe(&mut policy_layout, inputs.policy as i64, width);
+        PolicyNetwork::describe(&mut policy_layout, inputs, width);
         let policy_values =
             policy_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 0));
         let mut critic_layout = Layout::default();
-        CriticNetwork::describe(
-            &mut critic_layout,
-            inputs.critic as i64,
-            width,
-            section.critic_networks,
-        );
+        CriticNetwork::describe(&mut critic_layout, inputs, width, section.critic_networks);
         let critic_values =
             critic_layout.initial_values(derive(run_seed, Purpose::PolicyParameters, 1));
         let log_temperature = vec![section.initial_temperature.ln() as f32];
@@ -116,7 +111,7 @@ impl NativeSac {
             log_temperature: Learned::new(log_temperature, section.temperature_learning_rate),
             discount: section.discount as f32,
             target_rate: section.target_rate as f32,
-            target_entropy: section.target_entropy.value() as f32,
+            target_entropy: section.target_entropy.value(inputs.action) as f32,
             teacher: TeacherSection::default(),
             buffers: UpdateBuffers::default(),
         }
@@ -132,6 +127,7 @@ impl NativeSac {
     /// Draws actions from the current policy: a' for the next observations, a for the observations.
     fn draw(&mut self, team: &mut Team, columns: Columns<'_>, noise: &mut Noise) {
         let policy = &self.policy_parameters.values;
+        let action = self.inputs.action.numbers();
         let UpdateBuffers {
             rows,
             outputs,
@@ -139,7 +135,7 @@ impl NativeSac {
             policy: activations,
             ..
         } = &mut self.buffers;
-        let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * ACTION);
+        let (next_outputs, state_outputs) = outputs.split_at_mut(*rows * 2 * action);
         self.policy
             .forward_through(team, policy, columns.next_observations, next_outputs);
         self.policy
@@ -163,6 +159,7 @@ impl NativeSac {
         columns: Columns<'_>,
         temperature: f32,
     ) -> [f32; 4] {
+        let action = self.inputs.action.numbers();
         let UpdateBuffers {
             rows,
             sample,
@@ -173,12 +170,12 @@ impl NativeSac {
             ..
         } = &mut self.buffers;
         let (next_actions, next_log_prob) =
-            (&sample.actions[..*rows * ACTION], &sample.log_prob[..*rows]);
-        join(columns.next_states, next_actions, joined);
+            (&sample.actions[..*rows * action], &sample.log_prob[..*rows]);
+        join(columns.next_states, next_actions, action, joined);
         self.critic
             .forward_through(team, &self.target_parameters, joined, target_values);
 
-        join(columns.states, columns.actions, joined);
+        join(columns.states, columns.actions, action, joined);
         let critic = &self.critic_parameters.values;
         self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut value) = (0.0, 0.0);
@@ -224,6 +221,7 @@ impl NativeSac {
         temperature: f32,
     ) -> ([f32; 2], Option<f32>) {
         let weight = self.teacher.loss_weight_after(self.updates()) as f32;
+        let numbers = self.inputs.action.numbers();
         let UpdateBuffers {
             rows,
             sample,
@@ -239,8 +237,11 @@ impl NativeSac {
             &self.policy_parameters.values,
             &self.critic_parameters.values,
         );
-        let (actions, log_prob) = (&sample.actions[*rows * ACTION..], &sample.log_prob[*rows..]);
-        join(columns.states, actions, joined);
+        let (actions, log_prob) = (
+            &sample.actions[*rows * numbers..],
+            &sample.log_prob[*rows..],
+        );
+        join(columns.states, actions, numbers, joined);
         self.critic.forward(team, critic, joined, activations);
         let (mut loss, mut log_prob_sum) = (0.0, 0.0);
         let share = 1.0 / *rows as f32;
@@ -251,7 +252,7 @@ impl NativeSac {
             drawn_grad[row * ESTIMATES..][..ESTIMATES]
                 .copy_from_slice(&share_of_smaller(values).map(|part| -share * part));
         }
-        let action = self.inputs.critic..self.inputs.critic + ACTION;
+        let action = self.inputs.critic..self.inputs.critic + numbers;
         self.critic
             .backward_through(team, critic, activations, drawn_grad, action, action_grad);
         // Back through the drawn actions, then through the policy.
@@ -263,7 +264,7 @@ impl NativeSac {
         );
         let distance = columns.teacher_actions.map(|teacher| {
             let outputs = output(policy_activations);
-            imitate(outputs, teacher, weight, output_mut(policy_grad))
+            imitate(outputs, teacher, numbers, weight, output_mut(policy_grad))
         });
         self.policy
             .backward(team, policy, policy_activations, policy_grad);
@@ -282,16 +283,17 @@ impl NativeSac {
     /// Allocates the buffers for an update of `rows` transitions.
     fn allocate(&self, rows: usize) -> UpdateBuffers {
         let numbers = |rows: usize, width: usize| vec![0.0; rows * width];
+        let action = self.inputs.action.numbers();
         UpdateBuffers {
             rows,
-            outputs: numbers(2 * rows, 2 * ACTION),
-            sample: Sample::allocate(2 * rows),
-            joined: numbers(rows, self.inputs.critic + ACTION),
+            outputs: numbers(2 * rows, 2 * action),
+            sample: Sample::allocate(2 * rows, action),
+            joined: numbers(rows, self.inputs.critic + action),
             target_values: numbers(rows, ESTIMATES),
             critic: self.critic.allocate(rows),
             critic_grad: self.critic.allocate(rows),
             drawn_grad: numbers(rows, ESTIMATES),
-            action_grad: numbers(rows, ACTION),
+            action_grad: numbers(rows, action),
             policy: self.policy.allocate(rows),
             policy_grad: self.policy.allocate(rows),
         }
@@ -317,15 +319,16 @@ impl NativeSac {
         Ok(norms.map(f32::sqrt))
     }
 
-    /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
-        let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * ACTION];
+        let action = self.inputs.action.numbers();
+        let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * action];
         let policy = &self.policy_parameters.values;
         self.policy
             .forward_through(&mut Team::new(1), policy, observations, &mut outputs);
         let means = outputs
-            .chunks_exact(2 * ACTION)
-            .flat_map(|row| &row[..ACTION]);
+            .chunks_exact(2 * action)
+            .flat_map(|row| &row[..action]);
         means.map(|mean| mean.tanh()).collect()
     }
 }

@@ -2,7 +2,7 @@
 
 use skein_protocol::IMAGE_PIXELS;
 
-use crate::algorithm::Columns;
+use crate::algorithm::{Columns, Inputs};
 use crate::noise::Noise;
 
 /// Transitions that own their columns.
@@ -25,11 +25,17 @@ impl Transitions {
     /// Random numbers without meaning, observations `width` wide. Every third transition ends its
     /// task.
     pub(crate) fn random(width: usize, rows: usize, noise: &mut Noise) -> Self {
+        Self::random_for(Inputs::same(width), rows, noise)
+    }
+
+    /// The same, with observations and actions of `inputs`.
+    pub(crate) fn random_for(inputs: Inputs, rows: usize, noise: &mut Noise) -> Self {
+        let width = inputs.policy;
         let mut draw =
             |count: usize| -> Vec<f32> { (0..count).map(|_| noise.uniform(1.0)).collect() };
         Self {
             observations: draw(rows * width),
-            actions: draw(rows * 2),
+            actions: draw(rows * inputs.action.numbers()),
             rewards: draw(rows),
             next_observations: draw(rows * width),
             critic_states: None,

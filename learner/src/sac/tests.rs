@@ -72,8 +72,8 @@ fn published(sac: &dyn Algorithm) -> Vec<f32> {
 /// The published policy's action without noise, `[n, 2]`.
 fn mode(sac: &dyn Algorithm, section: &SacSection, observations: &[f32]) -> Vec<f32> {
     let mut layout = Layout::default();
-    let policy =
-        PolicyNetwork::describe(&mut layout, OBSERVATION as i64, section.hidden_width as i64);
+    let inputs = Inputs::same(OBSERVATION);
+    let policy = PolicyNetwork::describe(&mut layout, inputs, section.hidden_width as i64);
     let mut parameters = Parameters::initialise(layout, 0, Device::Cpu);
     let _guard = no_grad_guard();
     parameters

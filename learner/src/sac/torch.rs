@@ -2,7 +2,6 @@
 //! engine for CUDA devices.
 
 use skein_kernels::Team;
-use skein_protocol::ACTION;
 use skein_protocol::config::{SacSection, TeacherSection};
 use skein_protocol::seeds::{Purpose, derive};
 use tch::{Device, Tensor, no_grad_guard};
@@ -48,7 +47,7 @@ impl TorchSac {
     pub fn new(section: &SacSection, inputs: Inputs, run_seed: u64, device: Device) -> Self {
         let width = section.hidden_width as i64;
         let mut layout = Layout::default();
-        let policy = PolicyNetwork::describe(&mut layout, inputs.policy as i64, width);
+        let policy = PolicyNetwork::describe(&mut layout, inputs, width);
         let policy_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 0),
@@ -58,12 +57,7 @@ impl TorchSac {
         let perception = inputs
             .from_image
             .map(|latent| Perception::describe(&mut layout, latent));
-        let critic = CriticNetwork::describe(
-            &mut layout,
-            inputs.critic as i64,
-            width,
-            section.critic_networks,
-        );
+        let critic = CriticNetwork::describe(&mut layout, inputs, width, section.critic_networks);
         let critic_parameters = Parameters::initialise(
             layout,
             derive(run_seed, Purpose::PolicyParameters, 1),
@@ -86,7 +80,7 @@ impl TorchSac {
             log_temperature,
             discount: section.discount,
             target_rate: section.target_rate,
-            target_entropy: section.target_entropy.value(),
+            target_entropy: section.target_entropy.value(inputs.action),
             teacher: TeacherSection::default(),
         }
     }
@@ -101,7 +95,7 @@ impl TorchSac {
     /// Draws actions from the current policy, with their log-probabilities.
     fn draw(&self, observations: &Tensor, noise: &mut Noise) -> PolicySample {
         let noise = noise.normal(
-            &[observations.size()[0], ACTION as i64],
+            &[observations.size()[0], self.inputs.action.numbers() as i64],
             self.log_temperature.device(),
         );
         self.policy
@@ -126,7 +120,7 @@ impl TorchSac {
         )
     }
 
-    /// Returns the policy's action without noise, `[n, 2]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n, observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let _guard = no_grad_guard();
         let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);

@@ -85,7 +85,7 @@ fn error(algorithm: &Td3) -> f64 {
         .policy
         .output(&algorithm.policy_parameters, &observations)
         .tanh();
-    let wanted = observations.narrow(1, 0, ACTION as i64);
+    let wanted = observations.narrow(1, 0, 2);
     (actions - wanted).square().mean(None).double_value(&[])
 }
 

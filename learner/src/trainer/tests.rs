@@ -567,6 +567,9 @@ fn every_algorithm_that_can_starts_from_the_policy_of_a_snapshot() {
     let random = Trainer::new(&config).unwrap().snapshot(PolicyVersion(0));
     assert_ne!(random.values, begun.values);
     config.learning.start_from = Some(path);
+    config.learning.warmup_steps = 1000;
+    let exploration = Trainer::new(&config).unwrap().exploration();
+    assert_eq!(exploration, Exploration::Sample, "the policy warms up");
     let mut distill = config.clone();
     distill.learning.algorithm = AlgorithmName::Distill;
     distill.distill.hidden_width = config.sac.hidden_width;

@@ -21,7 +21,7 @@ use crate::metrics::Scalar;
 
 impl Training<'_> {
     /// Confirms the newest snapshot if it is a candidate, and keeps it if it is the best so far.
-    /// The last snapshot always is a candidate.
+    /// The last snapshot always is a candidate, and so is a policy that training starts from.
     ///
     /// The result depends on the state alone, and a second call does nothing: a run stopped here
     /// repeats it when resumed.
@@ -133,15 +133,18 @@ impl Training<'_> {
 
     pub(super) fn is_candidate(&self) -> bool {
         let progress = &self.progress;
-        let last = progress.episodes == self.config.run.episodes
-            && progress.latest_candidate != Some(progress.episodes);
-        last || is_candidate(
-            &self.config.evaluation,
-            progress.episodes,
-            progress.latest_candidate,
-            &self.metrics.windows().walls_passed,
-            progress.best.as_ref(),
-        )
+        let is_start = progress.episodes == 0 && self.config.learning.start_from.is_some();
+        let is_end = progress.episodes == self.config.run.episodes;
+        let is_new = progress.latest_candidate != Some(progress.episodes);
+        let always = (is_start || is_end) && is_new;
+        always
+            || is_candidate(
+                &self.config.evaluation,
+                progress.episodes,
+                progress.latest_candidate,
+                &self.metrics.windows().walls_passed,
+                progress.best.as_ref(),
+            )
     }
 
     /// Flies `episodes` evaluation episodes on each of `courses` with a published snapshot.

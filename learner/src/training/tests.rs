@@ -112,6 +112,29 @@ fn after_an_abandoned_epoch_all_files_are_those_of_the_checkpoint() {
 }
 
 #[test]
+fn a_policy_to_start_from_is_the_first_candidate() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = BegunRun::new(|config| {
+        let path = folder.path().join("policy.safetensors");
+        let layout = SnapshotLayout::of(config);
+        let snapshot = Snapshot {
+            version: PolicyVersion(7),
+            values: vec![0.0; layout.values()],
+        };
+        std::fs::write(&path, snapshot.to_file(&layout, config)).unwrap();
+        config.vae.train_steps = 0;
+        config.vae.start_from = Some(path.clone());
+        config.learning.start_from = Some(path);
+    });
+    let mut training = run.begin();
+    assert!(training.is_candidate());
+    training.progress.latest_candidate = Some(0);
+    assert!(!training.is_candidate(), "it is flown once");
+    let other = BegunRun::new(|_| {});
+    assert!(!other.begin().is_candidate());
+}
+
+#[test]
 fn a_checkpoint_is_due_every_so_many_episodes_since_the_last() {
     let run = BegunRun::new(|_| {});
     let mut training = run.begin();

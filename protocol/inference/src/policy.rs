@@ -7,7 +7,7 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use skein_kernels::{Finish, Isa};
 use skein_protocol::snapshot::{POLICY_LAYERS, PolicyHead};
-use skein_protocol::{ACTION, LOG_STD};
+use skein_protocol::{Action, LOG_STD, MAX_ACTION};
 
 use crate::linear::Linear;
 
@@ -25,20 +25,24 @@ pub struct PolicyScratch {
     values: [Vec<f32>; 2],
 }
 
-/// Distribution of a policy's action.
+/// Distribution of a policy's action. Its arrays end with as many zeros as an action does.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ActionDistribution {
     /// Gaussian that tanh squashes into an action; the parameters are those before tanh.
     SquashedGaussian {
-        /// Mean, `[2]`.
-        mean: [f32; ACTION],
-        /// Natural logarithm of the standard deviation, `[2]`, within [-20, 2].
-        log_std: [f32; ACTION],
+        /// Numbers of an action.
+        numbers: usize,
+        /// Mean of each number.
+        mean: Action,
+        /// Natural logarithm of each standard deviation, within [-20, 2].
+        log_std: Action,
     },
     /// Action with added noise.
     Noisy {
-        /// Action without noise, `[2]`, inside (-1, 1).
-        action: [f32; ACTION],
+        /// Numbers of an action.
+        numbers: usize,
+        /// Action without noise, inside (-1, 1).
+        action: Action,
         /// Standard deviation of the noise.
         std: f32,
     },
@@ -80,17 +84,22 @@ impl Policy {
             layer.apply(input, Finish::Rectified, output);
             std::mem::swap(input, output);
         }
-        let mut outputs = [0.0; 2 * ACTION];
-        last.apply(input, Finish::Plain, &mut outputs[..self.head.outputs()]);
+        let mut outputs = [0.0; 2 * MAX_ACTION];
+        let outputs = &mut outputs[..last.outputs()];
+        last.apply(input, Finish::Plain, outputs);
         match self.head {
-            PolicyHead::SquashedGaussian => ActionDistribution::SquashedGaussian {
-                mean: std::array::from_fn(|axis| outputs[axis]),
-                log_std: std::array::from_fn(|axis| {
-                    outputs[ACTION + axis].clamp(LOG_STD.0, LOG_STD.1)
-                }),
-            },
+            PolicyHead::SquashedGaussian => {
+                let numbers = outputs.len() / 2;
+                let (means, log_stds) = outputs.split_at(numbers);
+                ActionDistribution::SquashedGaussian {
+                    numbers,
+                    mean: action_of(means, |mean| mean),
+                    log_std: action_of(log_stds, |log_std| log_std.clamp(LOG_STD.0, LOG_STD.1)),
+                }
+            }
             PolicyHead::Noisy(std) => ActionDistribution::Noisy {
-                action: std::array::from_fn(|axis| outputs[axis].tanh()),
+                numbers: outputs.len(),
+                action: action_of(outputs, f32::tanh),
                 std,
             },
         }
@@ -98,26 +107,38 @@ impl Policy {
 }
 
 impl ActionDistribution {
-    /// Returns the action without noise, each command in [-1, 1].
-    pub fn mode(&self) -> [f32; ACTION] {
+    /// Returns the action without noise, each number in [-1, 1].
+    pub fn mode(&self) -> Action {
         match self {
             Self::SquashedGaussian { mean, .. } => mean.map(f32::tanh),
             Self::Noisy { action, .. } => *action,
         }
     }
 
-    /// Draws an action, each command in [-1, 1].
-    pub fn sample(&self, rng: &mut impl Rng) -> [f32; ACTION] {
-        std::array::from_fn(|axis| {
+    /// Draws an action, each number in [-1, 1].
+    pub fn sample(&self, rng: &mut impl Rng) -> Action {
+        let (Self::SquashedGaussian { numbers, .. } | Self::Noisy { numbers, .. }) = self;
+        let mut drawn = [0.0; MAX_ACTION];
+        for (axis, number) in drawn.iter_mut().take(*numbers).enumerate() {
             let noise: f32 = StandardNormal.sample(rng);
-            match self {
-                Self::SquashedGaussian { mean, log_std } => {
+            *number = match self {
+                Self::SquashedGaussian { mean, log_std, .. } => {
                     (mean[axis] + log_std[axis].exp() * noise).tanh()
                 }
-                Self::Noisy { action, std } => (action[axis] + std * noise).clamp(-1.0, 1.0),
-            }
-        })
+                Self::Noisy { action, std, .. } => (action[axis] + std * noise).clamp(-1.0, 1.0),
+            };
+        }
+        drawn
     }
+}
+
+/// Returns `numbers`, changed by `change`, with zeros behind them.
+fn action_of(numbers: &[f32], change: impl Fn(f32) -> f32) -> Action {
+    let mut action = [0.0; MAX_ACTION];
+    for (into, number) in action.iter_mut().zip(numbers) {
+        *into = change(*number);
+    }
+    action
 }
 
 #[cfg(test)]
@@ -128,6 +149,7 @@ mod tests {
 
     const OBSERVATION: usize = 34;
     const WIDTH: usize = 5;
+    const ACTION: usize = 2;
 
     /// Returns parameters by a fixed rule; small, so that no unit is always off.
     fn parameters(name: &str) -> Vec<f32> {
@@ -149,9 +171,9 @@ mod tests {
         })
     }
 
-    fn gaussian(policy: &Policy, observation: &[f32]) -> ([f32; ACTION], [f32; ACTION]) {
+    fn gaussian(policy: &Policy, observation: &[f32]) -> (Action, Action) {
         match policy.distribution(observation, &mut PolicyScratch::default()) {
-            ActionDistribution::SquashedGaussian { mean, log_std } => (mean, log_std),
+            ActionDistribution::SquashedGaussian { mean, log_std, .. } => (mean, log_std),
             other => panic!("{other:?}"),
         }
     }
@@ -191,12 +213,18 @@ mod tests {
     #[test]
     fn samples_have_the_stated_mean_and_deviation_and_stay_within_bounds() {
         let distribution = ActionDistribution::SquashedGaussian {
-            mean: [0.5, -3.0],
-            log_std: [-1.0, 2.0],
+            numbers: 3,
+            mean: [0.5, -3.0, 0.0, 0.0],
+            log_std: [-1.0, 2.0, 0.0, 0.0],
         };
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let draws: Vec<_> = (0..20_000).map(|_| distribution.sample(&mut rng)).collect();
         assert!(draws.iter().flatten().all(|command| command.abs() <= 1.0));
+        assert!(
+            draws
+                .iter()
+                .all(|action| action[2] != 0.0 && action[3] == 0.0)
+        );
         let before_squashing: Vec<f32> = draws.iter().map(|action| action[0].atanh()).collect();
         let mean = before_squashing.iter().sum::<f32>() / draws.len() as f32;
         let variance = before_squashing
@@ -215,10 +243,11 @@ mod tests {
     #[test]
     fn the_mode_is_the_squashed_mean() {
         let distribution = ActionDistribution::SquashedGaussian {
-            mean: [0.5, -40.0],
-            log_std: [0.0, 0.0],
+            numbers: 2,
+            mean: [0.5, -40.0, 0.0, 0.0],
+            log_std: [0.0; MAX_ACTION],
         };
-        assert_eq!(distribution.mode(), [0.5f32.tanh(), -1.0]);
+        assert_eq!(distribution.mode(), [0.5f32.tanh(), -1.0, 0.0, 0.0]);
     }
 
     #[test]
@@ -231,16 +260,17 @@ mod tests {
             values.leak()
         });
         let (_, log_std) = gaussian(&wild, &[0.0; OBSERVATION]);
-        assert_eq!(log_std, [2.0, -20.0]);
+        assert_eq!(log_std, [2.0, -20.0, 0.0, 0.0]);
     }
 
     #[test]
     fn noise_is_added_to_an_action_and_the_sum_stays_within_bounds() {
         let distribution = ActionDistribution::Noisy {
-            action: [0.2, 0.95],
+            numbers: 2,
+            action: [0.2, 0.95, 0.0, 0.0],
             std: 0.1,
         };
-        assert_eq!(distribution.mode(), [0.2, 0.95]);
+        assert_eq!(distribution.mode(), [0.2, 0.95, 0.0, 0.0]);
         let mut rng = Pcg64Mcg::seed_from_u64(1);
         let draws: Vec<_> = (0..20_000).map(|_| distribution.sample(&mut rng)).collect();
         let (mean, count) = (

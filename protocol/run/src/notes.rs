@@ -48,15 +48,15 @@ pub fn write(text: String) {
     }
 }
 
-/// Waits until what was written before is on standard error, for a second at most. Once that was
-/// in vain, no later call waits.
+/// Waits until what was written before is on standard error, for a second at most. Once that did
+/// not help, no later call waits.
 pub fn settle() {
-    static IN_VAIN: AtomicBool = AtomicBool::new(false);
+    static GAVE_UP: AtomicBool = AtomicBool::new(false);
     if let Some(queue) = QUEUE.get()
-        && !IN_VAIN.load(Ordering::Relaxed)
+        && !GAVE_UP.load(Ordering::Relaxed)
     {
         let settled = settle_within(queue, SETTLED_WITHIN);
-        IN_VAIN.store(!settled, Ordering::Relaxed);
+        GAVE_UP.store(!settled, Ordering::Relaxed);
     }
 }
 

@@ -6,8 +6,9 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::{InvalidValue, require};
+use crate::heading::in_heading_frame;
 use crate::segment::MAX_PRIOR_ACTIONS;
-use crate::{ACTION, LatentCode};
+use crate::{Action, ActionSpace, LatentCode};
 
 /// Largest `learning.average_updates`.
 const MAX_AVERAGED_UPDATES: usize = 1_000_000;
@@ -56,8 +57,8 @@ pub struct LearningSection {
     /// Policy input per step: `latent`, `latent+velocity` or `latent+velocity+action`. Default
     /// `latent`, as in the paper.
     pub observation: Observation,
-    /// Earlier steps that the policy also sees, as rising numbers of steps back; at most 16. Steps
-    /// before the reset count as the reset. A wall seen a second ago is out of view when the drone
+    /// Earlier steps that the policy also sees, as rising numbers of steps back; at most 16. A step
+    /// is a `simulator.vehicle.control_period_secs`. Steps before the reset count as the reset. A wall seen a second ago is out of view when the drone
     /// is in its opening. Default none, as in the paper.
     pub history_steps: Vec<usize>,
     /// `true` stores every episode a second time, mirrored left to right. Twice the transitions
@@ -296,8 +297,9 @@ pub enum Observation {
     /// The latent code of the depth image alone (the paper's state).
     #[serde(rename = "latent")]
     Latent,
-    /// The latent code and the vehicle's own lateral and vertical velocity in m/s. With a vehicle
-    /// that responds slowly, one image is not a full state.
+    /// The latent code and the vehicle's own velocity in m/s: to the left and up, and first
+    /// forward where the action chooses the speed. With a vehicle that responds slowly, one image
+    /// is not a full state.
     #[serde(rename = "latent+velocity")]
     LatentVelocity,
     /// The above and the previous action.
@@ -313,16 +315,20 @@ pub struct ObservationLayout {
     pub per_step: Observation,
     /// Length of the latent code, [`VaeSection::latent`](super::VaeSection::latent).
     pub latent: usize,
+    /// Numbers of an action.
+    pub action: ActionSpace,
     /// Numbers of steps back of the earlier steps.
     pub history_steps: Vec<usize>,
 }
 
 impl ObservationLayout {
-    /// Returns the layout of the present step alone, with a code of `latent` numbers.
+    /// Returns the layout of the present step alone, with a code of `latent` numbers and lateral
+    /// actions.
     pub fn present(per_step: Observation, latent: usize) -> Self {
         Self {
             per_step,
             latent,
+            action: ActionSpace::Lateral,
             history_steps: Vec::new(),
         }
     }
@@ -332,9 +338,15 @@ impl ObservationLayout {
         self.latent
             + match self.per_step {
                 Observation::Latent => 0,
-                Observation::LatentVelocity => 2,
-                Observation::LatentVelocityAction => 2 + ACTION,
+                Observation::LatentVelocity => self.velocity_len(),
+                Observation::LatentVelocityAction => self.velocity_len() + self.action.numbers(),
             }
+    }
+
+    /// Returns how many numbers of the velocity are seen: 2, left and up, of a drone that flies
+    /// forward at a constant speed; else 3.
+    pub fn velocity_len(&self) -> usize {
+        2 + usize::from(self.action.has_speed())
     }
 
     /// Returns the length of the observation vector.
@@ -347,8 +359,9 @@ impl ObservationLayout {
         false
     }
 
-    /// Writes the input of one step: latent code, then parts of `velocity_mps` (the vehicle's
-    /// forward, left and up velocity) and `previous_action` (zero at reset).
+    /// Writes the input of one step: latent code, then parts of the vehicle's velocity and
+    /// `previous_action` (zero at reset). `velocity_mps`: in the world; `orientation`: world from
+    /// body, as a unit quaternion (i, j, k, w), for a drone that turns.
     ///
     /// # Panics
     /// If `into` is not [`ObservationLayout::step_len`] long.
@@ -356,7 +369,8 @@ impl ObservationLayout {
         &self,
         code: &LatentCode,
         velocity_mps: &[f32; 3],
-        previous_action: &[f32; ACTION],
+        orientation: &[f32; 4],
+        previous_action: &Action,
         into: &mut [f32],
     ) {
         assert_eq!(
@@ -366,11 +380,17 @@ impl ObservationLayout {
         );
         self.write_code(code, into);
         let rest = &mut into[self.latent..];
+        let seen = self.velocity_len();
         if self.per_step != Observation::Latent {
-            rest[..2].copy_from_slice(&velocity_mps[1..]);
+            let velocity = match self.action {
+                // The nose keeps pointing along the corridor.
+                ActionSpace::Lateral | ActionSpace::Velocity => *velocity_mps,
+                ActionSpace::VelocityYaw => in_heading_frame(*velocity_mps, *orientation),
+            };
+            rest[..seen].copy_from_slice(&velocity[3 - seen..]);
         }
         if self.per_step == Observation::LatentVelocityAction {
-            rest[2..].copy_from_slice(previous_action);
+            rest[seen..].copy_from_slice(&previous_action[..self.action.numbers()]);
         }
     }
 

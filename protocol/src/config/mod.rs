@@ -23,7 +23,9 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::ActionSpace;
 use crate::segment::MAX_PRIOR_ACTIONS;
+use crate::transition::RecordLengths;
 
 pub use courses::CoursesSection;
 pub use distill::DistillSection;
@@ -166,11 +168,39 @@ impl Config {
         .filter_map(|(key, path)| path.as_mut().map(|path| (key, path)))
     }
 
+    /// Returns the numbers of an action: `simulator.vehicle.action`.
+    ///
+    /// It is the only key of the simulator's section that is read here, because the sizes of
+    /// networks and records' contents follow from it. [`Config::validate`] refuses other values.
+    pub fn action_space(&self) -> ActionSpace {
+        self.read_action_space().unwrap_or_default()
+    }
+
+    /// Returns the lengths of what records hold.
+    pub fn record_lengths(&self) -> RecordLengths {
+        RecordLengths {
+            latent: self.vae.latent,
+            action: self.action_space(),
+        }
+    }
+
+    fn read_action_space(&self) -> Option<ActionSpace> {
+        let Some(action) = self.action_value() else {
+            return Some(ActionSpace::default());
+        };
+        action.clone().try_into().ok()
+    }
+
+    fn action_value(&self) -> Option<&toml::Value> {
+        self.simulator.get("vehicle")?.get("action")
+    }
+
     /// Returns the layout of the policy's observation.
     pub fn observation_layout(&self) -> ObservationLayout {
         ObservationLayout {
             per_step: self.learning.observation,
             latent: self.vae.latent,
+            action: self.action_space(),
             history_steps: self.learning.history_steps.clone(),
         }
     }
@@ -210,6 +240,18 @@ impl Config {
             format!("nested {depth} deep"),
             format!(
                 "is deeper than {MAX_NESTING}: the stored configuration could not be read back"
+            ),
+        )?;
+        require(
+            self.read_action_space().is_some(),
+            "simulator.vehicle.action",
+            self.action_value()
+                .map_or_else(String::new, toml::Value::to_string),
+            format!(
+                "is none of {}: nothing else can be commanded",
+                ActionSpace::ALL
+                    .map(|space| format!("\"{}\"", space.name()))
+                    .join(", ")
             ),
         )?;
         require(

@@ -6,7 +6,7 @@ use super::{
     InvalidValue, require, require_batch_size, require_critic_networks, require_discount,
     require_learning_rate, require_width,
 };
-use crate::ACTION;
+use crate::ActionSpace;
 
 /// The `[sac]` section: soft actor-critic with learned temperature (arXiv:1812.05905). The paper
 /// specifies none of these values.
@@ -85,10 +85,13 @@ impl SacSection {
             self.initial_temperature,
             "is not a positive number: its logarithm is what is learned",
         )?;
+        let TargetEntropy::Nats(entropy) = self.target_entropy else {
+            return Ok(());
+        };
         require(
-            self.target_entropy.value().is_finite(),
+            entropy.is_finite(),
             "sac.target_entropy",
-            self.target_entropy.value(),
+            entropy,
             "is not a finite number",
         )
     }
@@ -106,10 +109,10 @@ pub enum TargetEntropy {
 }
 
 impl TargetEntropy {
-    /// Returns the entropy in nats.
-    pub fn value(self) -> f64 {
+    /// Returns the entropy in nats for a policy with these actions.
+    pub fn value(self, action: ActionSpace) -> f64 {
         match self {
-            Self::Auto => -(ACTION as f64),
+            Self::Auto => -(action.numbers() as f64),
             Self::Nats(value) => value,
         }
     }

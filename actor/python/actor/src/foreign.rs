@@ -13,7 +13,7 @@ use pyo3::types::{PyBytes, PyDict};
 use skein_protocol::config::{Config, CoursesSection, CriticInput};
 use skein_protocol::ticket::{CourseChoice, Ticket};
 use skein_protocol::transition::TransitionRecord;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, REWARD_TERMS};
+use skein_protocol::{Action, ActionSpace, GROUND_TRUTH, IMAGE_PIXELS, MAX_ACTION, REWARD_TERMS};
 use skein_rollout::courses::Courses;
 use skein_rollout::environment_loop::EpisodeFault;
 use skein_rollout::world::{World, Worlds};
@@ -63,6 +63,7 @@ pub(crate) struct ForeignWorlds<'a> {
     courses: Arc<Courses>,
     training: String,
     evaluation: Vec<String>,
+    action: ActionSpace,
     limits: Limits,
     /// Steps in this episode.
     steps: usize,
@@ -120,6 +121,7 @@ impl<'a> ForeignWorlds<'a> {
             courses,
             training: CoursesSection::names(&[&config.courses.training]).remove(0),
             evaluation: CoursesSection::names(&config.courses.evaluation),
+            action: config.action_space(),
             limits: Limits {
                 silence: Duration::from_secs_f64(config.transport.actor_silence_secs),
                 most_records: config.transport.max_records_per_episode,
@@ -264,10 +266,11 @@ impl World for ForeignWorlds<'_> {
         record.ground_truth = self.moment.ground_truth;
     }
 
-    fn step(&mut self, action: [f32; ACTION]) -> Result<StepReport, EpisodeFault> {
+    fn step(&mut self, action: Action) -> Result<StepReport, EpisodeFault> {
         let passed_before = self.moment.walls_passed;
+        let numbers = action[..self.action.numbers()].to_vec();
         self.ask("step", |bridge| {
-            Ok(bridge.call_method1("step", (action,))?.unbind())
+            Ok(bridge.call_method1("step", (numbers,))?.unbind())
         })?;
         self.steps += 1;
         self.check_length()?;
@@ -287,9 +290,19 @@ impl World for ForeignWorlds<'_> {
         })
     }
 
-    fn oracle_action(&mut self) -> Result<[f32; ACTION], EpisodeFault> {
-        let action = Python::attach(|py| self.bridge.bind(py).call_method0("oracle")?.extract());
-        action.map_err(|error| self.failure.keep(error))
+    fn oracle_action(&mut self) -> Result<Action, EpisodeFault> {
+        let numbers = self.action.numbers();
+        let asked = Python::attach(|py| -> PyResult<Vec<f32>> {
+            let oracle = self.bridge.bind(py).call_method1("oracle", (numbers,))?;
+            oracle.extract()
+        });
+        let asked = asked.map_err(|error| self.failure.keep(error))?;
+        let mut action = [0.0; MAX_ACTION];
+        action
+            .iter_mut()
+            .zip(asked)
+            .for_each(|(into, number)| *into = number);
+        Ok(action)
     }
 
     fn reward(&self, _: &RewardSettings, _: &StepReport, _: &[u8; IMAGE_PIXELS]) -> RewardTerms {

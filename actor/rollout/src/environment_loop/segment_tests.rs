@@ -1,5 +1,6 @@
 //! Tests that a segment is a function of its ticket, independent of who flew the earlier ones.
 
+use skein_protocol::MAX_ACTION;
 use skein_protocol::ids::{Attempt, EpisodeId, PolicyVersion};
 use skein_protocol::ticket::{CourseChoice, Exploration};
 
@@ -9,7 +10,7 @@ use super::tests::{
 use super::*;
 
 /// Returns `ticket` for the `steps` that follow `flown`.
-fn segment(ticket: &Ticket, steps: u32, flown: &[[f32; ACTION]]) -> Ticket {
+fn segment(ticket: &Ticket, steps: u32, flown: &[Action]) -> Ticket {
     Ticket {
         segment: Some(Segment {
             steps,
@@ -82,7 +83,7 @@ fn an_episode_in_segments_without_noise_is_the_episode_flown_whole() {
                         )
                     };
                     assert!(seen(end) == seen(next));
-                    assert_eq!(end.action, [0.0; ACTION]);
+                    assert_eq!(end.action, [0.0; MAX_ACTION]);
                 }
             }
         }
@@ -138,10 +139,8 @@ fn a_loop_resumes_only_the_exact_episode_that_it_paused() {
         ..next.clone()
     };
     assert!(flies_on(&environment_loop, &next) && flies_on(&environment_loop, &again));
-    let nearly = [
-        flown[0],
-        [flown[1][0], f32::from_bits(flown[1][1].to_bits() ^ 1)],
-    ];
+    let mut nearly = [flown[0], flown[1]];
+    nearly[1][1] = f32::from_bits(nearly[1][1].to_bits() ^ 1);
     for elsewhere in [
         segment(&ticket, 5, &flown[..1]),
         segment(&ticket, 5, &nearly),

@@ -1,11 +1,11 @@
 use std::sync::Arc;
 
 use bytemuck::Zeroable;
-use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Observation, ObservationLayout};
 use skein_protocol::ids::{Attempt, EpisodeId, RunId};
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_protocol::ticket::{CourseChoice, Exploration};
+use skein_protocol::{ActionSpace, IMAGE_PIXELS, MAX_ACTION};
 
 use super::*;
 use crate::courses::Courses;
@@ -142,11 +142,49 @@ fn a_ticket_flown_again_is_the_same_episode_bit_for_bit() {
 }
 
 #[test]
+fn actions_have_the_numbers_of_the_setting_and_zeros_behind_them() {
+    for action in ActionSpace::ALL {
+        let layout = ObservationLayout {
+            action,
+            ..observation_layout()
+        };
+        let snapshot_layout = SnapshotLayout::new(&layout, 16);
+        let network = Network::new(
+            &random_snapshot(&snapshot_layout, NETWORK.0),
+            &snapshot_layout,
+        );
+        let config = config(&format!("vehicle.action = \"{}\"", action.name()));
+        let courses = Arc::new(Courses::of_run(&config).unwrap());
+        let mut environment_loop = EnvironmentLoop::new(
+            ACTOR,
+            INCARNATION,
+            Simulators::new(courses),
+            Agent::new(layout),
+        );
+        for exploration in [Exploration::Uniform, Exploration::Sample, Exploration::Mode] {
+            let ticket = Ticket {
+                teacher_share: Some(0.0),
+                ..ticket(exploration, 1)
+            };
+            let mut tape = Tape::default();
+            environment_loop.fly(&ticket, &network, &mut tape).unwrap();
+            let (closing, steps) = tape.sent.split_last().unwrap();
+            assert_eq!(closing.action, [0.0; MAX_ACTION]);
+            for record in steps {
+                assert_eq!(record.check_lengths(config.record_lengths()), Ok(()));
+                let (own, beyond) = record.action.split_at(action.numbers());
+                assert!(own.iter().all(|number| *number != 0.0), "{own:?}");
+                assert!(beyond.iter().all(|number| *number == 0.0), "{beyond:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn a_snapshot_teaches_by_what_its_own_encoder_and_history_see() {
     let layout = ObservationLayout {
-        per_step: Observation::LatentVelocityAction,
-        latent: 8,
         history_steps: vec![2],
+        ..ObservationLayout::present(Observation::LatentVelocityAction, 8)
     };
     let snapshot_layout = SnapshotLayout::new(&layout, 16);
     let snapshot = random_snapshot(&snapshot_layout, 9);
@@ -168,10 +206,9 @@ fn a_snapshot_teaches_by_what_its_own_encoder_and_history_see() {
             let seen = &sent[seen_step];
             observed.extend(&teacher().encode(&seen.depth, &mut Scratch::default())[..8]);
             observed.extend(&seen.velocity_mps[1..]);
-            observed.extend(match seen_step {
-                0 => [0.0; 2],
-                _ => sent[seen_step - 1].action,
-            });
+            let before = seen_step.checked_sub(1);
+            let [left, up, ..] = before.map_or([0.0; MAX_ACTION], |before| sent[before].action);
+            observed.extend([left, up]);
         }
         let expected = teacher().distribution(&observed, &mut Scratch::default());
         assert_eq!(record.teacher_action, expected.mode(), "step {step}");
@@ -266,11 +303,15 @@ fn the_teacher_is_recorded_in_each_step_and_flies_its_share() {
     };
     let (_, alone) = fly(None);
     let (_, watched) = fly(Some(0.0));
-    assert!(alone.iter().all(|record| record.teacher_action == [0.0; 2]));
+    assert!(
+        alone
+            .iter()
+            .all(|record| record.teacher_action == [0.0; MAX_ACTION])
+    );
     assert!(
         watched
             .iter()
-            .any(|record| record.teacher_action != [0.0; 2])
+            .any(|record| record.teacher_action != [0.0; MAX_ACTION])
     );
     let actions = |records: &[Box<TransitionRecord>]| -> Vec<_> {
         records.iter().map(|record| record.action).collect()
@@ -406,9 +447,8 @@ fn a_disturbed_episode_is_a_function_of_its_ticket_too() {
 #[test]
 fn a_policy_with_a_history_acts_on_the_steps_in_its_records() {
     let observation_layout = ObservationLayout {
-        per_step: Observation::LatentVelocityAction,
-        latent: 16,
         history_steps: vec![1, 3],
+        ..ObservationLayout::present(Observation::LatentVelocityAction, 16)
     };
     let layout = SnapshotLayout::new(&observation_layout, 16);
     let network = Network::new(&random_snapshot(&layout, NETWORK.0), &layout);
@@ -437,7 +477,8 @@ fn a_policy_with_a_history_acts_on_the_steps_in_its_records() {
                 observed.extend(if seen_step == 0 {
                     [0.0; 2]
                 } else {
-                    tape.sent[seen_step - 1].action
+                    let [left, up, ..] = tape.sent[seen_step - 1].action;
+                    [left, up]
                 });
             }
             let action = network

@@ -7,7 +7,7 @@ use rapier3d::pipeline::PhysicsWorld;
 
 use super::*;
 use crate::disturbances::{Gust, GustSettings};
-use crate::vehicle::{Preset, Vehicle, VehicleSettings};
+use crate::vehicle::{Command, Preset, Vehicle, VehicleSettings};
 
 /// Largest difference accepted, m, m/s, rad/s, and of a quaternion's parts.
 const SAME: f32 = 1e-3;
@@ -46,7 +46,13 @@ impl Reference {
                 }
                 body.add_torque(glam(torque_nm), true);
             }
-            Actuation::Velocity(velocity_mps) => body.set_linvel(glam(velocity_mps), true),
+            Actuation::Motion {
+                velocity_mps,
+                yaw_rate_radps,
+            } => {
+                body.set_linvel(glam(velocity_mps), true);
+                body.set_angvel(glam(&(Vector3::z() * *yaw_rate_radps)), true);
+            }
         }
         self.physics.step();
     }
@@ -90,12 +96,15 @@ fn largest_difference(
     let mut gust = Gust::new(gusts, dt_secs, 7);
     let mut largest = 0.0_f32;
     for _ in 0..(secs / settings.control_period_secs) as u32 {
-        let velocity_mps = command();
+        let command = Command {
+            velocity_mps: command(),
+            yaw_rate_radps: 0.0,
+        };
         for _ in 0..physics_steps {
             let gust_n = gust.as_mut().map(Gust::advance);
-            let wrench = vehicles[0].actuate(&body.state(), &velocity_mps, dt_secs);
+            let wrench = vehicles[0].actuate(&body.state(), &command, dt_secs);
             body.advance(&wrench, gust_n);
-            let wrench = vehicles[1].actuate(&reference.state(), &velocity_mps, dt_secs);
+            let wrench = vehicles[1].actuate(&reference.state(), &command, dt_secs);
             reference.advance(&wrench, gust_n);
             largest = largest.max(difference(&body.state(), &reference.state()));
         }

@@ -9,7 +9,10 @@ use super::{
     CameraSettings, DepthCamera, IMAGE_PIXELS, IMAGE_WIDTH, ImageErrors, InstructionSet,
     ReferenceCamera,
 };
-use crate::course::{Course, GeneratorRanges, test_course};
+use crate::course::{
+    Course, ForestRanges, GatesRanges, GeneratorRanges, HallRanges, Moment, RoomsRanges, Sides,
+    WorldRanges, test_course,
+};
 
 /// Grey levels by which a pixel may differ, due to rounding.
 const ROUNDING: u8 = 1;
@@ -35,12 +38,21 @@ fn compare(
     settings: &CameraSettings,
     world_from_body: &Isometry3<f32>,
 ) -> ImageComparison {
-    let reference = ReferenceCamera::new(settings, course).unwrap();
+    compare_at(Moment::default(), course, settings, world_from_body)
+}
+
+fn compare_at(
+    moment: Moment,
+    course: &Course,
+    settings: &CameraSettings,
+    world_from_body: &Isometry3<f32>,
+) -> ImageComparison {
+    let reference = ReferenceCamera::new(settings, course, moment).unwrap();
     let mut drawn = [0; IMAGE_PIXELS];
     let mut traced = [0; IMAGE_PIXELS];
-    DepthCamera::new(settings, course)
-        .unwrap()
-        .render(world_from_body, &mut drawn);
+    let mut camera = DepthCamera::new(settings, course).unwrap();
+    camera.move_obstacles(moment);
+    camera.render(world_from_body, &mut drawn);
     reference.render(world_from_body, &mut traced);
 
     let view = settings.view(world_from_body);
@@ -150,6 +162,58 @@ proptest! {
         let settings = CameraSettings { horizontal_fov_deg, mount_pitch_deg, ..middle };
         let world_from_body = pose(lens(&course, wall, spot, share), quaternion);
         let comparison = compare(&course, &settings, &world_from_body);
+        prop_assert!(comparison.wrong.is_empty(), "{:?}", comparison.wrong);
+        prop_assert!(comparison.excused <= MOST_EXCUSED, "{} excused", comparison.excused);
+    }
+}
+
+/// Returns ranges of a kind of world: all shapes, still and moving, leaning and open.
+fn any_world() -> impl Strategy<Value = WorldRanges> {
+    let forest = ForestRanges {
+        density_per_m2: [0.02, 0.1],
+        lean_deg: 30.0,
+        branches: [0, 4],
+        sides: Sides::Open,
+        ..Default::default()
+    };
+    let hall = HallRanges {
+        balls: [2, 8],
+        ..Default::default()
+    };
+    prop_oneof![
+        Just(WorldRanges::Forest(forest)),
+        Just(WorldRanges::Hall(hall)),
+        Just(WorldRanges::Rooms(RoomsRanges::default())),
+        Just(WorldRanges::Gates(GatesRanges::default())),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    #[test]
+    fn the_drawn_image_of_a_world_equals_the_traced_one(
+        world in any_world(),
+        seed in any::<u64>(),
+        share in prop::array::uniform3(0.02f32..0.98),
+        quaternion in prop::array::uniform4(-1.0f32..1.0)
+            .prop_filter("too short to turn by", |q| q.iter().map(|c| c * c).sum::<f32>() > 0.1),
+        horizontal_fov_deg in 40.0f32..120.0,
+        secs in 0.0f32..60.0,
+    ) {
+        let ranges = GeneratorRanges { worlds: vec![world], ..Default::default() };
+        let course = Course::generate(seed, &ranges).unwrap();
+        let middle = lens_in_the_middle();
+        let settings = CameraSettings { horizontal_fov_deg, ..middle };
+        let bounds = course.corridor();
+        // Anywhere, also inside an obstacle: the backs of its faces are invisible.
+        let at = [
+            bounds.length_m * share[0],
+            bounds.width_m * (share[1] - 0.5),
+            bounds.height_m * share[2],
+        ];
+        let moment = Moment { secs, seed };
+        let comparison = compare_at(moment, &course, &settings, &pose(at, quaternion));
         prop_assert!(comparison.wrong.is_empty(), "{:?}", comparison.wrong);
         prop_assert!(comparison.excused <= MOST_EXCUSED, "{} excused", comparison.excused);
     }

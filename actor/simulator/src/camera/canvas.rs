@@ -7,6 +7,9 @@
 //! Parity decides which pixels lie inside an outline. Each edge flips every pixel to its right, in
 //! a row of 128 bits at once, so that holes and inward corners need no triangles. Two surfaces that
 //! share an edge compute the same pixel for it, so no crack opens between them.
+//!
+//! An obstacle has many small convex faces. Such a face has one run of pixels in each row, between the
+//! same edges, which costs a fraction of that.
 
 use super::settings::MIDDLE_PX;
 use super::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
@@ -54,6 +57,9 @@ const _: () = assert!(
     "a row of pixels fills the bits of a u128"
 );
 
+/// Pixels of a short run, which are raised all at once.
+const SHORT: usize = 16;
+
 /// Image being drawn.
 pub(super) struct DepthCanvas {
     nearness: Box<[[f32; IMAGE_WIDTH]; IMAGE_HEIGHT]>,
@@ -62,6 +68,12 @@ pub(super) struct DepthCanvas {
     /// First row that the outline touches.
     first_row: usize,
     end_row: usize,
+    /// Where the edges of a convex face cross the middle of each row, columns: the first crossing and
+    /// the last one. Meaningful only within [`Self::fill_convex`].
+    left: [f32; IMAGE_HEIGHT],
+    right: [f32; IMAGE_HEIGHT],
+    /// The same, as the first pixel of each row in the face and the first behind it.
+    runs: [[u32; IMAGE_HEIGHT]; 2],
 }
 
 impl DepthCanvas {
@@ -71,6 +83,9 @@ impl DepthCanvas {
             inside: [0; IMAGE_HEIGHT],
             first_row: IMAGE_HEIGHT,
             end_row: 0,
+            left: [0.0; IMAGE_HEIGHT],
+            right: [0.0; IMAGE_HEIGHT],
+            runs: [[0; IMAGE_HEIGHT]; 2],
         }
     }
 
@@ -118,6 +133,71 @@ impl DepthCanvas {
         self.end_row = 0;
     }
 
+    /// Draws a plane into a convex outline where it is the nearest so far. `plane` is asked for only if
+    /// a row is met.
+    #[inline(always)]
+    pub(super) fn fill_convex(&mut self, corners: &[ImagePoint], plane: impl Fn() -> Nearness) {
+        let rows = corners.iter().map(|corner| corner.row);
+        let (top, bottom) = rows.fold((f32::INFINITY, f32::NEG_INFINITY), |(least, most), row| {
+            (least.min(row), most.max(row))
+        });
+        let first = first_at_or_after(top, IMAGE_HEIGHT);
+        let end = first_at_or_after(bottom, IMAGE_HEIGHT);
+        let Some(&last) = corners.last().filter(|_| first < end) else {
+            return;
+        };
+        self.left[first..end].fill(f32::INFINITY);
+        self.right[first..end].fill(f32::NEG_INFINITY);
+        let mut from = last;
+        for &to in corners {
+            self.cross_rows(from, to);
+            from = to;
+        }
+        // All rows at once, before any of them is drawn.
+        for (run, sides) in self.runs.iter_mut().zip([&self.left, &self.right]) {
+            for (pixel, side) in run[first..end].iter_mut().zip(&sides[first..end]) {
+                *pixel = first_at_or_after(*side, IMAGE_WIDTH) as u32;
+            }
+        }
+        let plane = plane();
+        for row in first..end {
+            let [start, end] = [0, 1].map(|side| self.runs[side][row] as usize);
+            let at_row = plane.in_middle + (row as f32 + 0.5 - MIDDLE_PX[1]) * plane.per_row;
+            let pixels = &mut self.nearness[row];
+            match end.saturating_sub(start) {
+                0 => {}
+                1..=SHORT => raise_short(pixels, start..end, at_row, plane.per_column),
+                _ => raise(
+                    &mut pixels[start..end],
+                    &FROM_MIDDLE[start..end],
+                    at_row,
+                    plane.per_column,
+                ),
+            }
+        }
+    }
+
+    /// Notes where an edge of a convex face crosses the middles of rows.
+    #[inline(always)]
+    fn cross_rows(&mut self, a: ImagePoint, b: ImagePoint) {
+        // As in `add_edge`: surfaces on both sides of the edge must compute the same.
+        let (upper, lower) = if a.row < b.row { (a, b) } else { (b, a) };
+        let first = first_at_or_after(upper.row, IMAGE_HEIGHT);
+        let end = first_at_or_after(lower.row, IMAGE_HEIGHT);
+        if first >= end {
+            return;
+        }
+        let slope = (lower.column - upper.column) / (lower.row - upper.row);
+        let sides = self.left[first..end]
+            .iter_mut()
+            .zip(&mut self.right[first..end]);
+        for (row, (left, right)) in (first..end).zip(sides) {
+            let crossing = upper.column + (row as f32 + 0.5 - upper.row) * slope;
+            *left = if crossing < *left { crossing } else { *left };
+            *right = if crossing > *right { crossing } else { *right };
+        }
+    }
+
     /// Returns the drawn image as range over depth, 1 at the range or farther.
     #[inline(always)]
     pub(super) fn nearness(&self) -> &[[f32; IMAGE_WIDTH]; IMAGE_HEIGHT] {
@@ -150,10 +230,29 @@ fn raise(pixels: &mut [f32], columns: &[f32], at_row: f32, per_column: f32) {
     }
 }
 
+/// Raises a run of at most [`SHORT`] pixels of a row, like [`raise`].
+#[inline(always)]
+fn raise_short(
+    row: &mut [f32; IMAGE_WIDTH],
+    run: std::ops::Range<usize>,
+    at_row: f32,
+    per_column: f32,
+) {
+    let from = run.start.min(IMAGE_WIDTH - SHORT);
+    let (least, most) = (FROM_MIDDLE[run.start], FROM_MIDDLE[run.end - 1]);
+    let columns = &FROM_MIDDLE[from..from + SHORT];
+    for (pixel, column) in row[from..from + SHORT].iter_mut().zip(columns) {
+        let plane = at_row + column * per_column;
+        let is_raised = (*column >= least) & (*column <= most) & (plane > *pixel);
+        *pixel = if is_raised { plane } else { *pixel };
+    }
+}
+
 /// Returns the first pixel whose middle lies at or after `position`, at most `count`.
 #[inline(always)]
 fn first_at_or_after(position: f32, count: usize) -> usize {
     // Equals `ceil` without its call: truncation rounds down, and counted from the far end, up.
     let from_end = count as f32 + 1.0 - (position - 0.5).clamp(0.0, count as f32);
-    count + 1 - from_end as usize
+    // By way of `i32`, which costs one instruction where `usize` costs several.
+    count + 1 - from_end as i32 as usize
 }

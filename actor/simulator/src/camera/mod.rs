@@ -2,7 +2,7 @@
 //!
 //! The image is the planar depth (along the optical axis, not along the ray) in 8 bits. It is
 //! drawn, not traced: every surface of a course is flat, so a frame costs some hundred edges and a
-//! few thousand vector operations. [`ReferenceCamera`] traces the same surfaces ray by ray; a
+//! few thousand vector operations. A tree of boxes keeps what is out of sight from costing anything. [`ReferenceCamera`] traces the same surfaces ray by ray; a
 //! property test compares the two.
 
 mod canvas;
@@ -19,7 +19,7 @@ mod noise_tests;
 
 use nalgebra::Isometry3;
 
-use crate::course::Course;
+use crate::course::{Course, Moment};
 use crate::disturbances::DepthNoiseSettings;
 
 pub use instructions::InstructionSet;
@@ -39,6 +39,7 @@ pub const IMAGE_PIXELS: usize = IMAGE_WIDTH * IMAGE_HEIGHT;
 pub struct DepthCamera {
     settings: CameraSettings,
     scene: scene::Scene,
+    moment: Moment,
     canvas: canvas::DepthCanvas,
     noise: Option<noise::StereoNoise>,
     draw: instructions::DrawFunction,
@@ -61,7 +62,8 @@ impl DepthCamera {
         settings.validate()?;
         Ok(Self {
             settings: settings.clone(),
-            scene: scene::Scene::new(&course.mesh()),
+            scene: scene::Scene::new(course),
+            moment: Moment::default(),
             canvas: canvas::DepthCanvas::new(),
             noise: None,
             draw: InstructionSet::best().draw(),
@@ -74,6 +76,12 @@ impl DepthCamera {
     pub fn with_noise(mut self, settings: &DepthNoiseSettings) -> Self {
         self.noise = noise::StereoNoise::new(settings, &self.settings);
         self
+    }
+
+    /// Places the moving obstacles of a world for the images that follow. Without a call, they are
+    /// where [`Moment::default`] has them.
+    pub fn move_obstacles(&mut self, moment: Moment) {
+        self.moment = moment;
     }
 
     /// Draws the depth image into `image`, with the body at `world_from_body`.
@@ -109,7 +117,7 @@ fn draw(
     camera.canvas.clear();
     camera
         .scene
-        .draw(&camera.settings, view, &mut camera.canvas);
+        .draw(&camera.settings, view, camera.moment, &mut camera.canvas);
     match (errors, &camera.noise) {
         (ImageErrors::OfKey(key), Some(noise)) => noise.write(camera.canvas.nearness(), key, image),
         _ => camera.canvas.write(image),

@@ -10,7 +10,7 @@ use parry3d::shape::{TriMesh, TriMeshBuilderError};
 
 use super::settings::{CameraView, MIDDLE_PX};
 use super::{CameraSettings, IMAGE_PIXELS, IMAGE_WIDTH};
-use crate::course::Course;
+use crate::course::{Course, Moment};
 
 /// Depth camera that casts rays, for comparison in tests and benchmarks.
 pub struct ReferenceCamera {
@@ -19,12 +19,26 @@ pub struct ReferenceCamera {
 }
 
 impl ReferenceCamera {
-    /// Builds a camera in this course.
+    /// Builds a camera in this course, with moving obstacles where they are at `moment`.
     ///
     /// # Errors
     /// [`TriMeshBuilderError`] if the course's surfaces form no triangle mesh.
-    pub fn new(settings: &CameraSettings, course: &Course) -> Result<Self, TriMeshBuilderError> {
-        let mesh = course.mesh();
+    pub fn new(
+        settings: &CameraSettings,
+        course: &Course,
+        moment: Moment,
+    ) -> Result<Self, TriMeshBuilderError> {
+        let mut mesh = course.mesh();
+        for (number, obstacle) in course.obstacles().iter().enumerate() {
+            let mut surfaces = obstacle.mesh();
+            if let Some(motion) = obstacle.motion {
+                let offset_m = motion.offset_m(number, moment);
+                for vertex in &mut surfaces.vertices {
+                    *vertex += offset_m;
+                }
+            }
+            mesh.append(surfaces);
+        }
         let vertices = mesh
             .vertices
             .iter()

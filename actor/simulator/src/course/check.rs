@@ -5,12 +5,33 @@
 
 use super::{
     BODY_CLEARANCE_M, Course, CourseFault, DRONE_WIDTH_M, FRAME_M, FaultLocation, MAX_CORNERS,
-    MAX_WALLS, Shape, Wall, WallLabel, WallLayout, polygon,
+    MAX_WALLS, Shape, Sidestep, Wall, WallLabel, WallLayout, polygon,
 };
+use crate::oracle::{HOVER_BEHIND_START_M, HOVER_BEHIND_WALL_M};
 
 /// Distance flown at 1 m/s until a sidestep has settled, metres: three time constants of the
 /// slowest vehicle (0.9 s) plus half its length.
 pub(super) const SETTLING_M: f32 = 3.2;
+
+impl Sidestep {
+    /// Returns the distance that a sidestep of `shift_m` takes, metres. `to_hover_m`: distance that
+    /// hovering takes.
+    fn needed_m(self, shift_m: f32, to_hover_m: f32) -> f32 {
+        match self {
+            Self::Flying => shift_m + SETTLING_M,
+            Self::Hovering => to_hover_m,
+        }
+    }
+
+    /// Returns how far to the side the drone gets within `gap_m`, metres; negative for nowhere.
+    fn reach_m(self, gap_m: f32, to_hover_m: f32) -> f32 {
+        match self {
+            Self::Flying => gap_m - SETTLING_M,
+            Self::Hovering if gap_m >= to_hover_m => LARGEST_M,
+            Self::Hovering => -LARGEST_M,
+        }
+    }
+}
 
 /// Least room for the openings of a random course that the drone can reach, metres.
 pub(super) const NEAR_MIDDLE_M: f32 = 0.5;
@@ -214,17 +235,21 @@ fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
         wall.x_m - behind_m - start.offset_m,
         wall.safe_point[0].abs() + start.jitter_y_m,
         (wall.safe_point[1] - course.corridor.height_m / 2.0).abs() + start.jitter_z_m,
+        HOVER_BEHIND_START_M,
     );
     let from_wall = previous.map(|previous| {
         (
             wall.x_m - previous.x_m - course.wall_thickness_m,
             (wall.safe_point[0] - previous.safe_point[0]).abs(),
             (wall.safe_point[1] - previous.safe_point[1]).abs(),
+            HOVER_BEHIND_WALL_M,
         )
     });
-    for (gap_m, along_y_m, along_z_m) in [Some(from_start), from_wall].into_iter().flatten() {
+    for (gap_m, along_y_m, along_z_m, to_hover_m) in
+        [Some(from_start), from_wall].into_iter().flatten()
+    {
         let shift_m = along_y_m.max(along_z_m);
-        let needed_m = shift_m + SETTLING_M;
+        let needed_m = course.sidestep.needed_m(shift_m, to_hover_m);
         if gap_m < needed_m {
             return Err(CourseFault::TooClose {
                 wall: wall.label,
@@ -242,7 +267,8 @@ fn reachable(course: &Course, wall: &Wall) -> Result<(), CourseFault> {
 pub(super) fn in_reach(course: &Course, x_m: f32) -> [[f32; 2]; 2] {
     let (start, previous) = (course.start, course.walls.last());
     let behind_m = previous.map_or(0.0, |previous| previous.x_m);
-    let free_m = x_m - behind_m - start.offset_m - SETTLING_M;
+    let gap_m = x_m - behind_m - start.offset_m;
+    let free_m = course.sidestep.reach_m(gap_m, HOVER_BEHIND_START_M);
     let middle_m = course.corridor.height_m / 2.0;
     let (along_y_m, along_z_m) = (free_m - start.jitter_y_m, free_m - start.jitter_z_m);
     let mut ranges = [
@@ -250,7 +276,8 @@ pub(super) fn in_reach(course: &Course, x_m: f32) -> [[f32; 2]; 2] {
         [middle_m - along_z_m, middle_m + along_z_m],
     ];
     if let Some(previous) = previous {
-        let free_m = x_m - previous.x_m - course.wall_thickness_m - SETTLING_M;
+        let gap_m = x_m - previous.x_m - course.wall_thickness_m;
+        let free_m = course.sidestep.reach_m(gap_m, HOVER_BEHIND_WALL_M);
         for ([least, most], from_m) in ranges.iter_mut().zip(previous.safe_point) {
             *least = least.max(from_m - free_m);
             *most = most.min(from_m + free_m);
@@ -282,7 +309,7 @@ pub(super) fn leads_on(course: &Course, next_x_m: f32) -> Result<(), CourseFault
     })
 }
 
-fn in_range(
+pub(super) fn in_range(
     location: FaultLocation,
     key: &'static str,
     value: f32,

@@ -11,6 +11,8 @@ pub enum FaultLocation {
     Course,
     /// The definition of this wall.
     Wall(WallLabel),
+    /// The definition of this obstacle of a world, from 1 in the file's order.
+    Obstacle(usize),
 }
 
 impl fmt::Display for FaultLocation {
@@ -18,6 +20,7 @@ impl fmt::Display for FaultLocation {
         match self {
             Self::Course => f.write_str("course"),
             Self::Wall(label) => write!(f, "wall {label}"),
+            Self::Obstacle(number) => write!(f, "obstacle {number}"),
         }
     }
 }

@@ -11,7 +11,7 @@ use serde::Deserialize;
 use super::source_location::SourceLocation;
 use super::{
     Corridor, Course, CourseFault, CourseLayout, FaultLocation, Opening, Shape, StartArea,
-    WallLabel, WallLayout,
+    WallLabel, WallLayout, WorldFault, world,
 };
 use crate::text::{exactly, fits_in_a_table, message_of, parse_whole, read_text};
 
@@ -31,12 +31,20 @@ pub enum CourseError {
     Syntax {
         /// The file.
         path: PathBuf,
-        /// The wall whose definition holds the line.
+        /// The wall or obstacle whose definition holds the line.
         location: FaultLocation,
         /// The line, from 1.
         line: usize,
         /// The key and the problem on one line; the parser's own error takes several.
         message: String,
+    },
+    /// The file describes a world that cannot be flown.
+    #[error("{}: {source}", path.display())]
+    World {
+        /// The file.
+        path: PathBuf,
+        /// The fault.
+        source: WorldFault,
     },
     /// The file describes a course that cannot be flown.
     #[error("{}: {source}", path.display())]
@@ -62,14 +70,30 @@ impl Course {
         Self::parse(&text, path)
     }
 
+    /// Returns the mesh files that the course file `path` names, as they stand there.
+    ///
+    /// # Errors
+    /// As [`Course::load`], if the file cannot be read.
+    pub fn mesh_files(path: impl AsRef<Path>) -> Result<Vec<PathBuf>, CourseError> {
+        let path = path.as_ref();
+        let text = read_text(path).map_err(|source| CourseError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        Ok(world::mesh_files(&text))
+    }
+
     /// Reads a course from the text of a course file. `path` serves errors only.
     ///
     /// # Errors
     /// Like [`Course::load`].
     pub fn parse(text: &str, path: impl AsRef<Path>) -> Result<Self, CourseError> {
         let path = path.as_ref();
+        if world::is_world(text) {
+            return world::parse(text, path);
+        }
         let file: CourseFile =
-            parse_whole(text).map_err(|error| syntax_error(path, text, &error))?;
+            parse_whole(text).map_err(|error| CourseError::syntax(path, text, &error))?;
         file.layout()
             .and_then(Self::new)
             .map_err(|source| CourseError::Fault {
@@ -79,23 +103,25 @@ impl Course {
     }
 }
 
-/// Converts the parser's error to one that names the wall and the key.
-fn syntax_error(path: &Path, text: &str, error: &toml::de::Error) -> CourseError {
-    let SourceLocation {
-        line,
-        location,
-        key,
-    } = SourceLocation::of(error.span().unwrap_or_default(), text);
-    let problem = message_of(text, error);
-    let message = match key {
-        Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
-        _ => problem,
-    };
-    CourseError::Syntax {
-        path: path.to_owned(),
-        location,
-        line,
-        message,
+impl CourseError {
+    /// Converts the parser's error to one that names the wall or obstacle and the key.
+    pub(super) fn syntax(path: &Path, text: &str, error: &toml::de::Error) -> Self {
+        let SourceLocation {
+            line,
+            location,
+            key,
+        } = SourceLocation::of(error.span().unwrap_or_default(), text);
+        let problem = message_of(text, error);
+        let message = match key {
+            Some(key) if !problem.contains(&format!("`{key}`")) => format!("key {key}: {problem}"),
+            _ => problem,
+        };
+        Self::Syntax {
+            path: path.to_owned(),
+            location,
+            line,
+            message,
+        }
     }
 }
 

@@ -18,8 +18,8 @@ pub use layout::LayoutRanges;
 use layout::Layout;
 
 use super::{
-    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, Shape, StartArea, WallLabel,
-    WallLayout, check, polygon,
+    BODY_CLEARANCE_M, Corridor, Course, CourseFault, Opening, STAGES, Shape, StartArea, WallLabel,
+    WallLayout, WorldFault, WorldRanges, check, polygon, world,
 };
 use crate::text::exactly;
 
@@ -51,6 +51,10 @@ pub struct GeneratorRanges {
     /// `wall_thickness_m`, which then keep their defaults. Default: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub layout: Option<LayoutRanges>,
+    /// Kinds of worlds, drawn with equal probability. They replace all other keys, which then keep
+    /// their defaults. Default: none, that is, corridors.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub worlds: Vec<WorldRanges>,
 }
 
 /// A family of openings that the generator draws.
@@ -179,6 +183,14 @@ pub enum RangesError {
         /// The key of the fixed corridor.
         key: &'static str,
     },
+    /// Keys of corridors beside kinds of worlds.
+    #[error(
+        "generator: worlds excludes all other keys of the section: remove them, or remove worlds"
+    )]
+    WorldsAndCorridors,
+    /// A world is at fault.
+    #[error("generator: {0}")]
+    World(#[from] WorldFault),
     /// No families of openings.
     #[error("generator: shapes is empty: name at least one")]
     NoShapes,
@@ -208,6 +220,7 @@ impl Default for GeneratorRanges {
             clearance_m: [0.9, 1.15],
             rotation_deg: [-180.0, 180.0],
             layout: None,
+            worlds: Vec::new(),
         }
     }
 }
@@ -232,6 +245,9 @@ impl Course {
         ranges: &GeneratorRanges,
     ) -> Result<Self, RangesError> {
         ranges.validate()?;
+        if let Some(world) = ranges.draw_world(seed) {
+            return Ok(world::generate(seed, world)?);
+        }
         let layout = ranges.draw_layout(seed, level);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
         let mut course = Self::without_walls(
@@ -239,20 +255,23 @@ impl Course {
             layout.corridor,
             layout.start,
             layout.wall_thickness_m,
+            layout.sidestep(),
         )?;
         let next = layout.wall_x_m.iter().copied().map(Some).skip(1);
         for (&x_m, next_x_m) in layout.wall_x_m.iter().zip(next.chain([None])) {
-            course.add_random_wall(x_m, next_x_m, ranges, &mut rng)?;
+            let across_m = layout.across_m(course.walls.len());
+            course.add_random_wall(x_m, next_x_m, across_m, ranges, &mut rng)?;
         }
         Ok(course)
     }
 
     /// Draws walls until one can be flown after those already in the course, and leaves room for
-    /// the wall at `next_x_m`.
+    /// the wall at `next_x_m`. `across_m`: range of its opening's centre along y.
     fn add_random_wall(
         &mut self,
         x_m: f32,
         next_x_m: Option<f32>,
+        across_m: [f32; 2],
         ranges: &GeneratorRanges,
         rng: &mut impl Rng,
     ) -> Result<(), RangesError> {
@@ -265,7 +284,7 @@ impl Course {
             let layout = WallLayout {
                 label,
                 x_m,
-                opening: ranges.draw_opening(self, x_m, rng),
+                opening: ranges.draw_opening(self, x_m, across_m, rng),
             };
             match self.add_wall_before(layout, next_x_m) {
                 Ok(()) => return Ok(()),
@@ -300,6 +319,9 @@ impl GeneratorRanges {
     /// [`RangesError`] names the key or the wall.
     pub fn check(&self) -> Result<(), RangesError> {
         const HARDEST: std::ops::Range<u64> = 0..8;
+        for world in &self.worlds {
+            world::generate(0, world)?;
+        }
         Course::generate(0, self)?;
         let Some(layout) = &self.layout else {
             return Ok(());
@@ -316,16 +338,25 @@ impl GeneratorRanges {
     /// Returns the longest corridor of a course, and the start that lies farthest from its end.
     #[must_use]
     pub fn longest(&self) -> (Corridor, StartArea) {
+        let lengths_m = self.worlds.iter().map(WorldRanges::length_m);
+        if let Some(length_m) = lengths_m.reduce(f32::max) {
+            let corridor = Corridor {
+                length_m,
+                ..self.corridor
+            };
+            return (corridor, self.start);
+        }
         match &self.layout {
             Some(layout) => layout.longest(),
             None => (self.corridor, self.start),
         }
     }
 
-    /// Returns the most walls of a course.
+    /// Returns the most walls, or stages, of a course.
     #[must_use]
     pub fn most_walls(&self) -> usize {
         match &self.layout {
+            _ if !self.worlds.is_empty() => STAGES.into(),
             Some(layout) => layout.walls[1].into(),
             None => self.wall_x_m.len(),
         }
@@ -338,6 +369,16 @@ impl GeneratorRanges {
         }
         check_range("clearance_m", self.clearance_m, BODY_CLEARANCE_M, 50.0)?;
         check_range("rotation_deg", self.rotation_deg, -360.0, 360.0)?;
+        if !self.worlds.is_empty() {
+            let of_corridors = Self {
+                worlds: Vec::new(),
+                ..self.clone()
+            };
+            return match of_corridors == Self::default() {
+                true => Ok(()),
+                false => Err(RangesError::WorldsAndCorridors),
+            };
+        }
         let Some(layout) = &self.layout else {
             return Ok(());
         };
@@ -358,6 +399,13 @@ impl GeneratorRanges {
         layout.validate()
     }
 
+    /// Draws the kind of world of a seed; `None` if the ranges are for corridors.
+    fn draw_world(&self, seed: u64) -> Option<&WorldRanges> {
+        let kinds = self.worlds.len();
+        let mut rng = Pcg64Mcg::seed_from_u64(!seed);
+        (kinds > 0).then(|| &self.worlds[rng.random_range(0..kinds)])
+    }
+
     /// Draws from a generator of its own, so that the openings of a seed do not depend on whether
     /// corridors vary.
     fn draw_layout(&self, seed: u64, level: u8) -> Layout {
@@ -368,16 +416,22 @@ impl GeneratorRanges {
                 start: self.start,
                 wall_x_m: self.wall_x_m.clone(),
                 wall_thickness_m: self.wall_thickness_m,
+                slalom: None,
             },
         }
     }
 
     /// Draws an opening for the next wall of `course`, where the drone can reach it.
-    fn draw_opening(&self, course: &Course, x_m: f32, rng: &mut impl Rng) -> Opening {
+    fn draw_opening(
+        &self,
+        course: &Course,
+        x_m: f32,
+        across_m: [f32; 2],
+        rng: &mut impl Rng,
+    ) -> Opening {
         let kind = self.shapes[rng.random_range(0..self.shapes.len())];
         let clearance_m = rng.random_range(self.clearance_m[0]..=self.clearance_m[1]);
         let shape = kind.draw(clearance_m, rng);
-        let (half_y, height) = (course.corridor.width_m / 2.0, course.corridor.height_m);
         let [in_reach_y, in_reach_z] = check::in_reach(course, x_m);
         // A shape's safe point may lie beside its centre, but not farther than its free space.
         let mut within = |[least, most]: [f32; 2], [near, far]: [f32; 2]| {
@@ -387,8 +441,8 @@ impl GeneratorRanges {
         Opening {
             shape,
             centre_m: [
-                within([-half_y, half_y], in_reach_y),
-                within([0.0, height], in_reach_z),
+                within(across_m, in_reach_y),
+                within([0.0, course.corridor.height_m], in_reach_z),
             ],
             rotation_deg: rng.random_range(self.rotation_deg[0]..=self.rotation_deg[1]),
         }

@@ -6,7 +6,7 @@
 use earcut::Earcut;
 use nalgebra::{Point3, Vector3};
 
-use super::{Course, Wall};
+use super::{Course, Sides, Wall};
 
 /// Part of the course to which a surface belongs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -18,6 +18,8 @@ pub(crate) enum SurfaceKind {
     /// A wall with an opening, by its place in course order from 0: its front, its back and the
     /// inside of its opening.
     Wall(usize),
+    /// An obstacle of a world.
+    Obstacle,
 }
 
 /// A flat face, visible from the side to which its normal points.
@@ -34,8 +36,8 @@ pub(crate) struct MeshSurface {
     pub(crate) offset_m: f32,
 }
 
-/// Surfaces of a course, and their corners in the world frame.
-#[derive(Debug, Clone, PartialEq)]
+/// Surfaces of a course or of an obstacle, and their corners in the world frame.
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Mesh {
     /// Corners, metres.
     pub(crate) vertices: Vec<Point3<f32>>,
@@ -45,11 +47,11 @@ pub(crate) struct Mesh {
 
 impl Mesh {
     pub(super) fn of(course: &Course) -> Self {
-        let mut mesh = Self {
-            vertices: Vec::new(),
-            surfaces: Vec::new(),
-        };
-        mesh.add_corridor(course);
+        let mut mesh = Self::default();
+        match course.sides() {
+            Sides::Closed => mesh.add_corridor(course),
+            Sides::Open => mesh.add_floor(course),
+        }
         for (place, wall) in course.walls().iter().enumerate() {
             mesh.add_wall(course, place, wall);
         }
@@ -86,6 +88,19 @@ impl Mesh {
         triangles
     }
 
+    /// Adds the surfaces of another mesh.
+    pub(crate) fn append(&mut self, other: Self) {
+        let first = self.vertices.len() as u32;
+        self.vertices.extend(other.vertices);
+        self.surfaces
+            .extend(other.surfaces.into_iter().map(|mut surface| {
+                for vertex in surface.loops.iter_mut().flatten() {
+                    *vertex += first;
+                }
+                surface
+            }));
+    }
+
     fn triangle_normal(&self, triangle: [u32; 3]) -> Vector3<f32> {
         let [a, b, c] = triangle.map(|v| self.vertices[v as usize]);
         (b - a).cross(&(c - a))
@@ -95,8 +110,12 @@ impl Mesh {
         let corridor = course.corridor();
         let first = self.add_ring(0.0, &rim_of(course));
         let last = self.add_ring(corridor.length_m, &rim_of(course));
+        let end = match course.is_world() {
+            true => SurfaceKind::Corridor,
+            false => SurfaceKind::EndWall,
+        };
         self.add_surface(SurfaceKind::Corridor, vec![first.clone()], Vector3::x());
-        self.add_surface(SurfaceKind::EndWall, vec![last.clone()], -Vector3::x());
+        self.add_surface(end, vec![last.clone()], -Vector3::x());
         // The rim runs along the floor, up the left side, back along the ceiling and down the right
         // side.
         let inwards = [Vector3::z(), -Vector3::y(), -Vector3::z(), Vector3::y()];
@@ -107,6 +126,32 @@ impl Mesh {
                 inward,
             );
         }
+    }
+
+    fn add_floor(&mut self, course: &Course) {
+        let first = self.add_ring(0.0, &rim_of(course));
+        let last = self.add_ring(course.corridor().length_m, &rim_of(course));
+        let floor = vec![band(&first, &last, 0)];
+        self.add_surface(SurfaceKind::Corridor, floor, Vector3::z());
+    }
+
+    /// Adds a face of an obstacle. Its first loop runs counter-clockwise seen from the free side,
+    /// the others, if any, are holes.
+    pub(super) fn add_face(&mut self, loops: Vec<Vec<u32>>) {
+        let normal = self.newell_normal(&loops[0]);
+        self.add_surface(SurfaceKind::Obstacle, loops, normal);
+    }
+
+    /// Returns the unit normal of a loop, towards the side from which it runs counter-clockwise.
+    fn newell_normal(&self, ring: &[u32]) -> Vector3<f32> {
+        // Relative to the first corner: far from the origin, the products would lose their digits.
+        let origin = self.vertices[ring[0] as usize];
+        let from = ring
+            .iter()
+            .map(|&corner| self.vertices[corner as usize] - origin);
+        let to = from.clone().cycle().skip(1);
+        let twice_area: Vector3<f32> = from.zip(to).map(|(a, b)| a.cross(&b)).sum();
+        twice_area.normalize()
     }
 
     fn add_wall(&mut self, course: &Course, place: usize, wall: &Wall) {

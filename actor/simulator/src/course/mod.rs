@@ -1,4 +1,5 @@
-//! Courses: a corridor, its walls and their openings, in the order in which the drone meets them.
+//! Courses: a corridor, its walls and their openings, in the order in which the drone meets them; or
+//! a world of obstacles between a start and a goal.
 //!
 //! Every [`Course`] can be flown: [`Course::new`] refuses anything else and names the wall, the key
 //! and the remedy. So neither the physics nor the camera checks again. The drone sees and hits the
@@ -12,11 +13,15 @@ mod fault;
 mod file;
 mod generator;
 mod mesh;
+mod motion;
+mod obstacle;
 mod opening;
 mod polygon;
 mod source_location;
+mod world;
 
 use std::fmt;
+use std::sync::Arc;
 
 use nalgebra::Point3;
 use rand::{Rng, RngExt};
@@ -26,7 +31,15 @@ pub use fault::{CourseFault, FaultLocation, NoSuchLevel};
 pub use file::CourseError;
 pub use generator::{GeneratedShape, GeneratorRanges, LayoutRanges, RangesError};
 pub(crate) use mesh::{Mesh, MeshSurface, SurfaceKind};
+pub use motion::{Moment, Motion};
+pub use obstacle::{Obstacle, ObstacleShape, ROUND_SIDES, TriangleMesh};
 pub use opening::{CIRCLE_SIDES, Opening, Shape};
+pub use world::{
+    ForestRanges, GatesRanges, HallRanges, MAX_OBSTACLES, MAX_TRIANGLES, Region, RoomsRanges,
+    STAGES, Sides, WorldFault, WorldLayout, WorldRanges,
+};
+
+use world::World;
 
 /// Width and length of the drone's body, metres. Source: AirSim's generic quadrotor mesh, 0.98 x
 /// 0.98 x 0.29 m.
@@ -142,14 +155,27 @@ pub struct Wall {
     clearance_m: f32,
 }
 
-/// A corridor with walls that the drone can fly from the start to the end wall.
+/// A corridor with walls, or a world of obstacles, that the drone can fly from the start to the end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Course {
     name: String,
     corridor: Corridor,
     start: StartArea,
     wall_thickness_m: f32,
+    sidestep: Sidestep,
     walls: Vec<Wall>,
+    /// Obstacles, start and goal of a world, which has no walls.
+    world: Option<Arc<World>>,
+}
+
+/// How a drone gets from one opening to the next, and so how far apart walls must be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Sidestep {
+    /// While it flies on at 1 m/s.
+    #[default]
+    Flying,
+    /// While it hovers between the walls.
+    Hovering,
 }
 
 impl Course {
@@ -163,6 +189,7 @@ impl Course {
             layout.corridor,
             layout.start,
             layout.wall_thickness_m,
+            Sidestep::Flying,
         )?;
         check::wall_count(layout.walls.len())?;
         for wall in layout.walls {
@@ -177,13 +204,16 @@ impl Course {
         corridor: Corridor,
         start: StartArea,
         wall_thickness_m: f32,
+        sidestep: Sidestep,
     ) -> Result<Self, CourseFault> {
         let course = Self {
             name,
             corridor,
             start,
             wall_thickness_m,
+            sidestep,
             walls: Vec::new(),
+            world: None,
         };
         check::corridor_and_start(&course)?;
         Ok(course)
@@ -234,13 +264,14 @@ impl Course {
         &self.name
     }
 
-    /// Returns the inner size of the corridor.
+    /// Returns the inner size of the corridor, or the bounds of a world.
     #[must_use]
     pub fn corridor(&self) -> Corridor {
         self.corridor
     }
 
-    /// Returns the area in which episodes start.
+    /// Returns the area in which episodes start. Of a world, only its offset has a meaning: the end of
+    /// a corridor lies as far behind it as the goal from the start.
     #[must_use]
     pub fn start(&self) -> StartArea {
         self.start
@@ -259,20 +290,74 @@ impl Course {
         &self.walls
     }
 
-    /// Returns the number of walls whose back face lies before `x_m`. With `x_m` of the drone's
-    /// tail, these are the walls that it has left.
-    pub(crate) fn walls_before(&self, x_m: f32) -> usize {
+    /// Returns `true` for a world of obstacles, `false` for a corridor with walls.
+    #[must_use]
+    pub fn is_world(&self) -> bool {
+        self.world.is_some()
+    }
+
+    /// Returns the visibility of sides and ceiling: a corridor is closed.
+    pub(crate) fn sides(&self) -> Sides {
+        self.world
+            .as_ref()
+            .map_or(Sides::Closed, |world| world.sides)
+    }
+
+    /// Returns the obstacles of a world; a corridor has none.
+    #[must_use]
+    pub fn obstacles(&self) -> &[Obstacle] {
+        self.world.as_ref().map_or(&[], |world| &world.obstacles)
+    }
+
+    /// Returns the goal of a world; `None` for a corridor, whose end wall is the destination.
+    #[must_use]
+    pub fn goal(&self) -> Option<Region> {
+        self.world.as_ref().map(|world| *world.goal())
+    }
+
+    /// Returns the number of walls or stages that a drone at `position_m` with its tail at `tail_x_m`
+    /// has left: walls whose back face lies before its tail, or stages of the way.
+    pub(crate) fn walls_behind(&self, position_m: &Point3<f32>, tail_x_m: f32) -> usize {
+        if let Some(world) = &self.world {
+            return world.stages_behind(position_m);
+        }
         self.walls
             .iter()
-            .take_while(|wall| wall.x_m + self.wall_thickness_m < x_m)
+            .take_while(|wall| wall.x_m + self.wall_thickness_m < tail_x_m)
             .count()
     }
 
-    /// Returns the number of start levels: one before each wall.
+    /// Returns where to fly next in a world from `position_m`: a point on the way, at most about
+    /// `ahead_m` away and in sight. `None` in a corridor.
+    pub(crate) fn aim_m(&self, position_m: &Point3<f32>, ahead_m: f32) -> Option<Point3<f32>> {
+        let world = self.world.as_ref()?;
+        Some(world.aim(position_m, ahead_m))
+    }
+
+    /// Returns the distance left from `position_m` to the end wall, or along the way to the goal of
+    /// a world, metres.
+    pub(crate) fn to_end_m(&self, position_m: &Point3<f32>) -> f32 {
+        match &self.world {
+            Some(world) => world.left_m(position_m),
+            None => self.corridor.length_m - position_m.x,
+        }
+    }
+
+    /// Returns `true` if the end can be reached from `position_m`: in a world, the point lies inside
+    /// no obstacle.
+    pub(crate) fn is_reachable(&self, position_m: &Point3<f32>) -> bool {
+        let world = self.world.as_ref();
+        world.is_none_or(|world| world.is_reachable(position_m))
+    }
+
+    /// Returns the number of start levels: one before each wall, or one for each stage of a world.
     #[must_use]
     pub fn levels(&self) -> u8 {
-        // `new` allows at most MAX_WALLS.
-        self.walls.len() as u8
+        match self.world {
+            Some(_) => STAGES,
+            // `new` allows at most MAX_WALLS.
+            None => self.walls.len() as u8,
+        }
     }
 
     /// Draws the start position of an episode of `level` (1 = before the first wall), world frame,
@@ -288,6 +373,9 @@ impl Course {
         let levels = self.levels();
         if !(1..=levels).contains(&level) {
             return Err(NoSuchLevel { level, levels });
+        }
+        if let Some(world) = &self.world {
+            return Ok(world.start_position(level, rng));
         }
         let behind_m = match level {
             1 => 0.0,
@@ -305,6 +393,20 @@ impl Course {
         ))
     }
 
+    /// Returns the triangles of all obstacles of a world that stand still: corners in the world
+    /// frame, metres, counter-clockwise seen from the free side.
+    #[must_use]
+    pub fn obstacle_triangles(&self) -> Vec<[[f32; 3]; 3]> {
+        let still = self.obstacles().iter().filter(|one| one.motion.is_none());
+        let mut all = Vec::new();
+        for mesh in still.map(Obstacle::mesh) {
+            let corner = |vertex: u32| mesh.vertices[vertex as usize].coords.into();
+            let triangles = mesh.triangles().into_iter();
+            all.extend(triangles.map(|(triangle, _)| triangle.map(corner)));
+        }
+        all
+    }
+
     /// Returns the triangles of each wall, by wall in course order: corners in the world frame,
     /// metres, counter-clockwise seen from the free side.
     #[must_use]
@@ -320,7 +422,7 @@ impl Course {
         walls
     }
 
-    /// Returns all surfaces of the course, seen from the inside.
+    /// Returns all surfaces of the course but its obstacles, seen from the inside.
     pub(crate) fn mesh(&self) -> Mesh {
         Mesh::of(self)
     }

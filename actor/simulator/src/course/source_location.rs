@@ -1,6 +1,6 @@
-//! Location of a parser error in a course file: line, wall and key.
+//! Location of a parser error in a course file: line, wall or obstacle, and key.
 //!
-//! The parser reports a byte, but a user thinks in walls. The search goes by lines instead of
+//! The parser reports a byte, but a user thinks in walls and obstacles. The search goes by lines instead of
 //! parsed tables, because a file that is not TOML still has walls and keys.
 
 use std::ops::Range;
@@ -12,7 +12,7 @@ use super::{FaultLocation, WallLabel};
 pub(super) struct SourceLocation {
     /// The line, from 1.
     pub(super) line: usize,
-    /// The wall whose table holds the line, if its label can be read.
+    /// The wall whose table holds the line, if its label can be read, or the obstacle.
     pub(super) location: FaultLocation,
     /// The key whose value holds the line, or the name of the table that begins there.
     pub(super) key: Option<String>,
@@ -29,12 +29,15 @@ impl SourceLocation {
             .filter(|byte| *byte == b'\n')
             .count();
         let (mut table, mut label, mut key) = ("", None, None);
+        let mut obstacles = 0;
         for (number, text) in (1..).zip(text.lines().map(str::trim_start)) {
             if let Some(header) = header(text) {
                 if number > line {
                     break;
                 }
-                (table, label, key) = (header, None, (header != "wall").then_some(header));
+                let is_item = ["wall", "obstacle"].contains(&header);
+                (table, label, key) = (header, None, (!is_item).then_some(header));
+                obstacles += usize::from(header == "obstacle");
                 continue;
             }
             // Any other line is a comment or continues the value of the previous key.
@@ -46,11 +49,15 @@ impl SourceLocation {
                 label = integer_after(name, text);
             }
         }
+        let location = match (table, label) {
+            // `[[obstacle.opening]]` belongs to the obstacle before it.
+            _ if table.split('.').next() == Some("obstacle") => FaultLocation::Obstacle(obstacles),
+            (_, Some(label)) => FaultLocation::Wall(WallLabel(label)),
+            (_, None) => FaultLocation::Course,
+        };
         Self {
             line,
-            location: label.map_or(FaultLocation::Course, |label| {
-                FaultLocation::Wall(WallLabel(label))
-            }),
+            location,
             key: key.filter(|_| !whole_file).map(str::to_owned),
         }
     }

@@ -2,11 +2,13 @@
 
 use std::collections::VecDeque;
 
+use skein_action::{Action, MAX_ACTION};
+
 /// Queue that delays each action by a number of control periods. Until the first action arrives,
-/// the command sideways and up is zero.
+/// all its numbers are zero.
 #[derive(Debug, Clone)]
 pub(crate) struct CommandDelay {
-    pending: VecDeque<[f32; 2]>,
+    pending: VecDeque<Action>,
 }
 
 impl CommandDelay {
@@ -22,7 +24,7 @@ impl CommandDelay {
     /// Discards all pending actions and delays the following ones by `periods`.
     pub(crate) fn begin(&mut self, periods: u32) {
         self.pending.clear();
-        self.pending.resize(periods as usize, [0.0, 0.0]);
+        self.pending.resize(periods as usize, [0.0; MAX_ACTION]);
     }
 
     /// Returns the number of control periods until a command takes effect.
@@ -31,7 +33,7 @@ impl CommandDelay {
     }
 
     /// Queues `action` and returns the action that takes effect now.
-    pub(crate) fn pass(&mut self, action: [f32; 2]) -> [f32; 2] {
+    pub(crate) fn pass(&mut self, action: Action) -> Action {
         self.pending.push_back(action);
         self.pending.pop_front().unwrap_or(action)
     }

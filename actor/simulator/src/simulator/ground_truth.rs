@@ -1,17 +1,18 @@
 //! Ground truth: facts about a moment that the camera does not show.
 
-use crate::course::{Course, Wall};
+use crate::course::{BODY_CLEARANCE_M, Course, Wall};
 use crate::vehicle::VehicleState;
 
 /// Facts about a moment that the camera does not show: for the critic in training, never for the
 /// policy.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// Openings of the next two walls that the drone's tail has not left.
+    /// Openings of the next two walls that the drone's tail has not left; in a world, two points of
+    /// the way, up to 3 and 6 m ahead.
     pub ahead: [OpeningAhead; 2],
     /// Position left and up from the middle of the corridor, m.
     pub from_middle_m: [f32; 2],
-    /// Distance to the end wall, m.
+    /// Distance to the end wall, or along the way to the goal of a world, m.
     pub to_end_m: f32,
     /// The drone's mass relative to its nominal mass.
     pub mass_factor: f32,
@@ -76,10 +77,22 @@ impl OpeningAhead {
         walls_behind: usize,
         state: &VehicleState,
     ) -> [Self; 2] {
+        if let Some(next) = Self::on_the_way(course, 3.0, state)
+            && let Some(after) = Self::on_the_way(course, 6.0, state)
+        {
+            return [next, after];
+        }
         let walls = &course.walls()[walls_behind..];
         let mut walls = walls.iter().map(|wall| Self::of_wall(wall, state));
         let mut next = || walls.next().unwrap_or_else(|| Self::of_end(course, state));
         [next(), next()]
+    }
+
+    /// Returns the point to fly to in a world, at most `ahead_m` away: what an opening is to a
+    /// corridor.
+    fn on_the_way(course: &Course, ahead_m: f32, state: &VehicleState) -> Option<Self> {
+        let aim = course.aim_m(&state.position_m, ahead_m)?;
+        Some(Self::seen(aim.x, [aim.y, aim.z], BODY_CLEARANCE_M, state))
     }
 
     pub(crate) fn of_wall(wall: &Wall, state: &VehicleState) -> Self {

@@ -16,8 +16,8 @@ mod tests;
 
 use std::sync::Arc;
 
-use nalgebra::Vector3;
 use rand::Rng;
+use skein_action::{Action, MAX_ACTION};
 
 pub use error::{SimulationError, SimulatorError};
 pub use ground_truth::{GroundTruth, OpeningAhead};
@@ -29,8 +29,8 @@ pub use crate::step_report::{EpisodeOutcome, LevelUp, Obstacle, StepReport};
 use crate::camera::{DepthCamera, IMAGE_PIXELS};
 use crate::course::{Course, NoSuchLevel};
 use crate::disturbances::{CommandDelay, DisturbanceSettings, DrawnDisturbances, Gust};
-use crate::oracle;
-use crate::vehicle::{Vehicle, VehicleState};
+use crate::oracle::Oracle;
+use crate::vehicle::{Command, Vehicle, VehicleSettings, VehicleState};
 use crate::world::{Contact, World};
 
 /// A drone in a course.
@@ -39,7 +39,7 @@ pub struct Simulator {
     max_steps: u32,
     physics_steps: u32,
     dt_secs: f32,
-    forward_speed_mps: f32,
+    vehicle_settings: VehicleSettings,
     pristine_vehicle: Vehicle,
     vehicle: Vehicle,
     world: World,
@@ -99,7 +99,7 @@ impl Simulator {
             max_steps: settings.max_steps,
             physics_steps,
             dt_secs,
-            forward_speed_mps: settings.vehicle.forward_speed_mps,
+            vehicle_settings: settings.vehicle.clone(),
             pristine_vehicle: vehicle.clone(),
             vehicle,
             world,
@@ -132,9 +132,15 @@ impl Simulator {
         disturbances: &mut impl Rng,
     ) -> Result<(), NoSuchLevel> {
         let position_m = self.course.start_position(level, start)?;
+        // A corridor's episodes draw nothing more.
+        let motion_seed = match self.course.obstacles() {
+            [] => 0,
+            _ => start.next_u64(),
+        };
         let drawn = DrawnDisturbances::draw(&self.disturbances, disturbances);
         self.vehicle = self.pristine_vehicle.clone();
-        self.world.reset(&position_m, drawn.mass_factor);
+        self.world
+            .reset(&position_m, drawn.mass_factor, motion_seed);
         let DrawnDisturbances {
             disturbed,
             mass_factor,
@@ -160,8 +166,10 @@ impl Simulator {
         Ok(())
     }
 
-    /// Flies one control period with `action` = `[v_y, v_z]`, m/s in the heading frame, each
-    /// clamped to [-1, 1]. With latency, `action` takes effect some steps later.
+    /// Flies one control period with `action`: the numbers of
+    /// [`VehicleSettings::action`](crate::vehicle::VehicleSettings::action) in order, each clamped
+    /// to [-1, 1]. Missing ones are 0, further ones are ignored. With latency, `action` takes effect
+    /// some steps later.
     ///
     /// If the body touches something, the episode ends at that physics step, within the control
     /// period, and the state is that of the contact.
@@ -169,15 +177,18 @@ impl Simulator {
     /// # Errors
     /// [`SimulationError::NonFinite`] names what is NaN or infinite, in the action or the physics;
     /// it ends the episode. [`SimulationError::NotFlying`] if no episode is in progress.
-    pub fn step(&mut self, action: [f32; 2]) -> Result<StepReport, SimulationError> {
+    pub fn step<const N: usize>(
+        &mut self,
+        action: [f32; N],
+    ) -> Result<StepReport, SimulationError> {
         if self.episode.phase == EpisodePhase::Over {
             return Err(SimulationError::NotFlying);
         }
         self.episode.steps += 1;
         let walls_behind_before = self.episode.walls_behind;
 
-        let velocity_mps = self.commanded_velocity(action)?;
-        let contact = self.fly_until_contact(&velocity_mps)?;
+        let command = self.command(action)?;
+        let contact = self.fly_until_contact(&command)?;
         let outcome = self.outcome(contact);
 
         if outcome.is_some() {
@@ -199,6 +210,7 @@ impl Simulator {
     /// belong to the step: rendering twice gives the same image.
     pub fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]) {
         let pose = self.world.state().pose();
+        self.camera.move_obstacles(self.world.moment());
         match self.episode.depth_seed {
             Some(seed) => {
                 let key = seed ^ u64::from(self.episode.steps);
@@ -214,13 +226,16 @@ impl Simulator {
         self.world.state()
     }
 
-    /// Returns the oracle's action `[v_y, v_z]` for the current moment, m/s in the heading frame,
-    /// each in [-1, 1].
+    /// Returns the oracle's action for the current moment, each number in [-1, 1].
     #[must_use]
-    pub fn oracle_action(&self) -> [f32; 2] {
-        let hold_m = self.world.tail_x_m() - oracle::HOLD_M;
-        let walls_behind = self.course.walls_before(hold_m);
-        oracle::action(&self.course, walls_behind, &self.state())
+    pub fn oracle_action(&self) -> Action {
+        let oracle = Oracle {
+            course: &self.course,
+            vehicle: &self.vehicle_settings,
+            half_length_m: self.vehicle.body().half_extents_m.x,
+        };
+        let command = oracle.command(self.world.tail_x_m(), &self.state());
+        self.vehicle_settings.action_for(&command)
     }
 
     /// Returns the ground truth of the current moment, which the camera does not show.
@@ -228,11 +243,11 @@ impl Simulator {
     pub fn ground_truth(&self) -> GroundTruth {
         let state = self.state();
         let corridor = self.course.corridor();
-        let [x_m, y_m, z_m] = state.position_m.coords.into();
+        let [_, y_m, z_m] = state.position_m.coords.into();
         GroundTruth {
             ahead: OpeningAhead::next_two(&self.course, self.walls_left(), &state),
             from_middle_m: [y_m, z_m - corridor.height_m / 2.0],
-            to_end_m: corridor.length_m - x_m,
+            to_end_m: self.course.to_end_m(&state.position_m),
             mass_factor: self.episode.mass_factor,
             latency_periods: self.commands.periods() as f32,
             gust_n: self
@@ -265,22 +280,23 @@ impl Simulator {
         &self.course
     }
 
-    fn commanded_velocity(&mut self, action: [f32; 2]) -> Result<Vector3<f32>, SimulationError> {
+    fn command<const N: usize>(&mut self, action: [f32; N]) -> Result<Command, SimulationError> {
+        const { assert!(N <= MAX_ACTION, "an action has at most MAX_ACTION numbers") };
         if !action.iter().all(|v| v.is_finite()) {
             return Err(self.abort("action"));
         }
-        let [left, up] = self.commands.pass(action.map(|v| v.clamp(-1.0, 1.0)));
-        Ok(Vector3::new(self.forward_speed_mps, left, up))
+        let mut numbers = [0.0; MAX_ACTION];
+        numbers[..N].copy_from_slice(&action.map(|v| v.clamp(-1.0, 1.0)));
+        let taken = self.commands.pass(numbers);
+        Ok(self.vehicle_settings.command(&taken))
     }
 
-    fn fly_until_contact(
-        &mut self,
-        velocity_mps: &Vector3<f32>,
-    ) -> Result<Contact, SimulationError> {
+    fn fly_until_contact(&mut self, command: &Command) -> Result<Contact, SimulationError> {
+        let counted = self.episode.walls_behind;
         for _ in 0..self.physics_steps {
             let actuation = self
                 .vehicle
-                .actuate(&self.world.state(), velocity_mps, self.dt_secs);
+                .actuate(&self.world.state(), command, self.dt_secs);
             let gust_n = self.gust.as_mut().map(Gust::advance);
             self.world.advance(&actuation, gust_n);
 
@@ -288,7 +304,7 @@ impl Simulator {
                 return Err(self.abort("the body's pose or velocity"));
             }
             let contact = self.world.contact();
-            self.count_walls(contact);
+            self.count_walls(contact, counted);
             if contact != Contact::Nothing {
                 return Ok(contact);
             }
@@ -296,17 +312,19 @@ impl Simulator {
         Ok(Contact::Nothing)
     }
 
-    /// Counts the walls passed after a physics step that ended with `contact`.
-    fn count_walls(&mut self, contact: Contact) {
+    /// Counts the walls passed after a physics step that ended with `contact`. `counted`: walls that
+    /// earlier control periods counted.
+    fn count_walls(&mut self, contact: Contact, counted: usize) {
         let passed = self.episode.walls_behind;
         self.episode.walls_behind = match contact {
-            // A passed wall stays passed if a gust blows the drone back without a collision.
+            // A passed wall stays passed if the drone comes back without a collision.
             Contact::Nothing | Contact::EndWall => passed.max(self.walls_left()),
-            // No episode passes a wall and hits it, not even one that is blown back into it.
+            // No step passes a wall and hits it. What an earlier step reported stands, even if the
+            // drone flies or is blown back into that wall.
             Contact::Obstacle => self
                 .world
                 .touched_wall()
-                .map_or(passed, |hit| hit.min(passed)),
+                .map_or(passed, |hit| hit.min(passed).max(counted)),
         };
     }
 
@@ -326,13 +344,18 @@ impl Simulator {
         match self.world.touched_wall() {
             // A course has at most `MAX_WALLS` walls.
             Some(place) => Obstacle::Wall(place as u8 + 1),
+            // An obstacle of a world is named by its stage.
+            None if self.world.touches_obstacle() => {
+                Obstacle::Wall(self.level().min(self.course.levels()))
+            }
             None => Obstacle::Corridor,
         }
     }
 
-    /// Returns the number of walls that the whole body is clear of.
+    /// Returns the number of walls that the whole body is clear of, or of stages behind it.
     fn walls_left(&self) -> usize {
-        self.course.walls_before(self.world.tail_x_m())
+        let position_m = self.world.state().position_m;
+        self.course.walls_behind(&position_m, self.world.tail_x_m())
     }
 
     fn abort(&mut self, what: &'static str) -> SimulationError {

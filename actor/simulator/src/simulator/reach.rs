@@ -7,7 +7,7 @@ use crate::course::{Corridor, DRONE_WIDTH_M, StartArea};
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error(
     "corridor.length_m = {length_m}: the end lies {needed_m:.1} m from the start, but an episode \
-     flies at most {reach_m:.1} m ([simulator] vehicle.forward_speed_mps = {speed_mps} · \
+     flies at most {reach_m:.1} m ([simulator] vehicle.{speed_key} = {speed_mps} · \
      vehicle.control_period_secs = {period_secs} · max_steps = {max_steps}): set \
      simulator.max_steps to {enough_steps} or more, fly faster, or shorten the course"
 )]
@@ -15,6 +15,7 @@ pub struct OutOfReach {
     length_m: f32,
     needed_m: f64,
     reach_m: f64,
+    speed_key: &'static str,
     speed_mps: f32,
     period_secs: f32,
     max_steps: u32,
@@ -29,7 +30,7 @@ impl SimulatorSettings {
     /// [`OutOfReach`] has the distances, their keys and the remedy.
     pub fn check_reach(&self, corridor: Corridor, start: StartArea) -> Result<(), OutOfReach> {
         let (speed_mps, period_secs) = (
-            self.vehicle.forward_speed_mps,
+            self.vehicle.top_speed_mps(),
             self.vehicle.control_period_secs,
         );
         let step_m = f64::from(speed_mps) * f64::from(period_secs);
@@ -43,6 +44,10 @@ impl SimulatorSettings {
             length_m: corridor.length_m,
             needed_m,
             reach_m,
+            speed_key: match self.vehicle.action.has_speed() {
+                true => "max_speed_mps",
+                false => "forward_speed_mps",
+            },
             speed_mps,
             period_secs,
             max_steps: self.max_steps,

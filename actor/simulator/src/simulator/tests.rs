@@ -26,11 +26,11 @@ fn rng(seed: u64) -> Pcg64Mcg {
 }
 
 /// Flies `choose_action` to the end and returns each step's state and report.
-fn fly(
+fn fly<const N: usize>(
     simulator: &mut Simulator,
     level: u8,
     seed: u64,
-    choose_action: impl Fn(&Simulator) -> [f32; 2],
+    choose_action: impl Fn(&Simulator) -> [f32; N],
 ) -> Vec<(VehicleState, StepReport)> {
     simulator
         .reset(level, &mut rng(seed), &mut rng(!seed))

@@ -55,22 +55,35 @@ impl VehicleState {
     /// Returns the velocity in the heading frame, m/s: x where the nose points, y left of it, z up.
     /// A real drone can measure it.
     pub fn heading_velocity_mps(&self) -> Vector3<f32> {
+        self.in_heading_frame(&self.velocity_mps)
+    }
+
+    /// Returns a vector of the world in the heading frame.
+    pub(crate) fn in_heading_frame(&self, vector: &Vector3<f32>) -> Vector3<f32> {
         let [i, j, k, w]: [f32; 4] = self.world_from_body.coords.into();
         // Where the nose points, seen from above: no angle is needed.
         let (along, beside) = (1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j + w * k));
         let level = (along * along + beside * beside).sqrt();
         if level == 0.0 {
             // The nose points straight up or down.
-            return self.velocity_mps;
+            return *vector;
         }
         let (cos, sin) = (along / level, beside / level);
-        let velocity = self.velocity_mps;
         Vector3::new(
-            cos * velocity.x + sin * velocity.y,
-            cos * velocity.y - sin * velocity.x,
-            velocity.z,
+            cos * vector.x + sin * vector.y,
+            cos * vector.y - sin * vector.x,
+            vector.z,
         )
     }
+}
+
+/// Motion that an action asks for, in the heading frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Command {
+    /// Forward, left, up, m/s.
+    pub(crate) velocity_mps: Vector3<f32>,
+    /// Turning rate of the nose to the left, rad/s.
+    pub(crate) yaw_rate_radps: f32,
 }
 
 /// Effect of the vehicle on its rigid body during one physics step, in the world frame.
@@ -81,8 +94,12 @@ pub(crate) enum Actuation {
         force_n: Vector3<f32>,
         torque_nm: Vector3<f32>,
     },
-    /// Velocity during the step, m/s; the body neither falls nor turns.
-    Velocity(Vector3<f32>),
+    /// Velocity during the step, m/s, and turning rate about the upright axis, rad/s; the body does
+    /// not fall.
+    Motion {
+        velocity_mps: Vector3<f32>,
+        yaw_rate_radps: f32,
+    },
 }
 
 /// Mass and size of the rigid body that rapier integrates.
@@ -148,12 +165,11 @@ impl Vehicle {
         }
     }
 
-    /// Runs controller and rotors for `dt_secs` towards the velocity command `velocity_mps`
-    /// (heading frame).
+    /// Runs controller and rotors for `dt_secs` towards `command`.
     pub(crate) fn actuate(
         &mut self,
         state: &VehicleState,
-        velocity_mps: &Vector3<f32>,
+        command: &Command,
         dt_secs: f32,
     ) -> Actuation {
         match self {
@@ -162,8 +178,8 @@ impl Vehicle {
                 cascade,
                 rotors,
             } => {
-                let command = cascade.command(&airframe.gains, state, velocity_mps, dt_secs);
-                let wrench = rotors.advance(airframe, &command, dt_secs);
+                let turn = cascade.command(&airframe.gains, state, command, dt_secs);
+                let wrench = rotors.advance(airframe, &turn, dt_secs);
                 let force_n = Vector3::z() * wrench.thrust_n + drag_n(airframe, state);
                 Actuation::Wrench {
                     force_n: state.world_from_body * force_n,
@@ -174,9 +190,11 @@ impl Vehicle {
                 // The lag's exact solution over one step, so that the result does not depend on the
                 // step's length.
                 let reached = 1.0 - (-dt_secs / *time_constant_secs).exp();
-                Actuation::Velocity(
-                    state.velocity_mps + (velocity_mps - state.velocity_mps) * reached,
-                )
+                let wanted = state.world_from_body * command.velocity_mps;
+                Actuation::Motion {
+                    velocity_mps: state.velocity_mps + (wanted - state.velocity_mps) * reached,
+                    yaw_rate_radps: command.yaw_rate_radps,
+                }
             }
         }
     }

@@ -1,6 +1,10 @@
 //! The `[simulator.vehicle]` section of the configuration.
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
+use skein_action::{Action, ActionSpace, Axis, MAX_ACTION};
+
+use super::Command;
 
 /// A drone that can be flown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -22,15 +26,22 @@ pub enum Preset {
 pub struct VehicleSettings {
     /// The drone that flies. Default `airsim`, the paper's.
     pub preset: Preset,
+    /// Numbers of an action: `lateral` (left and up, at a constant speed forward), `velocity`
+    /// (forward, left and up) or `velocity+yaw` (also the nose's turning rate). Default `lateral`,
+    /// as in the paper.
+    pub action: ActionSpace,
     /// Time between two actions, s, 0.01 to 5. Default 0.5: the paper's step counts imply 0.5 to
     /// 1 s.
     pub control_period_secs: f32,
     /// Least rate of physics and flight controller, Hz, 200 to 10,000. It is rounded up to whole
     /// steps per control period. Default 200.
     pub physics_hz: f32,
-    /// Forward velocity commanded throughout an episode, m/s, 0.05 to 10. Default 1, as in the
-    /// paper.
+    /// Forward velocity commanded throughout an episode, m/s, 0.05 to 10; for `lateral` alone.
+    /// Default 1, as in the paper.
     pub forward_speed_mps: f32,
+    /// Forward velocity that an action of 1 commands, m/s, 0.05 to 5; not for `lateral`. An action
+    /// of 0 hovers, and -1 flies back at 1 m/s. Default 1.
+    pub max_speed_mps: f32,
     /// Time constant of the `point` preset's velocity, s, 0.01 to 10; other presets ignore it.
     /// Default 0.3.
     pub point_time_constant_secs: f32,
@@ -40,9 +51,11 @@ impl Default for VehicleSettings {
     fn default() -> Self {
         Self {
             preset: Preset::Airsim,
+            action: ActionSpace::Lateral,
             control_period_secs: 0.5,
             physics_hz: 200.0,
             forward_speed_mps: 1.0,
+            max_speed_mps: 1.0,
             point_time_constant_secs: 0.3,
         }
     }
@@ -77,6 +90,14 @@ impl VehicleSettings {
                 10.0,
                 "the drone would never arrive, or would cross surfaces between two steps",
             ),
+            // Faster than the tilt limit and the camera's range allow to stop in time.
+            (
+                "max_speed_mps",
+                self.max_speed_mps,
+                0.05,
+                5.0,
+                "the drone would never arrive, or could not stop before what it sees",
+            ),
             (
                 "point_time_constant_secs",
                 self.point_time_constant_secs,
@@ -98,6 +119,48 @@ impl VehicleSettings {
             }
         }
         Ok(())
+    }
+
+    /// Returns the largest speed forward that can be commanded, m/s.
+    #[must_use]
+    pub fn top_speed_mps(&self) -> f32 {
+        match self.action.has_speed() {
+            true => self.max_speed_mps,
+            false => self.forward_speed_mps,
+        }
+    }
+
+    /// Returns what `action` commands.
+    pub(crate) fn command(&self, action: &Action) -> Command {
+        let mut command = Command {
+            velocity_mps: Vector3::new(self.forward_speed_mps, 0.0, 0.0),
+            yaw_rate_radps: 0.0,
+        };
+        for (axis, number) in self.action.axes().iter().zip(action) {
+            let value = axis.command(*number, self.max_speed_mps);
+            match axis {
+                Axis::Forward => command.velocity_mps.x = value,
+                Axis::Left => command.velocity_mps.y = value,
+                Axis::Up => command.velocity_mps.z = value,
+                Axis::YawRate => command.yaw_rate_radps = value,
+            }
+        }
+        command
+    }
+
+    /// Returns the action that comes nearest to a command.
+    pub(crate) fn action_for(&self, command: &Command) -> Action {
+        let mut action = [0.0; MAX_ACTION];
+        for (axis, number) in self.action.axes().iter().zip(&mut action) {
+            let value = match axis {
+                Axis::Forward => command.velocity_mps.x,
+                Axis::Left => command.velocity_mps.y,
+                Axis::Up => command.velocity_mps.z,
+                Axis::YawRate => command.yaw_rate_radps,
+            };
+            *number = axis.number(value, self.max_speed_mps);
+        }
+        action
     }
 
     /// Returns the number of physics steps in one control period, and the length of one, s.
@@ -144,6 +207,34 @@ mod tests {
         let (steps, dt_secs) = settings.physics_steps();
         assert_eq!(steps, 70);
         assert!(1.0 / dt_secs >= 210.0);
+    }
+
+    #[test]
+    fn an_action_commands_what_its_space_says() {
+        let command = |action: ActionSpace| {
+            let settings = VehicleSettings {
+                action,
+                forward_speed_mps: 1.5,
+                max_speed_mps: 4.0,
+                ..Default::default()
+            };
+            let Command {
+                velocity_mps,
+                yaw_rate_radps,
+            } = settings.command(&[0.5, -0.25, 0.75, -1.0]);
+            let back = settings.action_for(&settings.command(&[0.5, -0.25, 0.75, -1.0]));
+            let numbers = action.numbers();
+            assert_eq!(back[..numbers], [0.5, -0.25, 0.75, -1.0][..numbers]);
+            [
+                velocity_mps.x,
+                velocity_mps.y,
+                velocity_mps.z,
+                yaw_rate_radps,
+            ]
+        };
+        assert_eq!(command(ActionSpace::Lateral), [1.5, 0.5, -0.25, 0.0]);
+        assert_eq!(command(ActionSpace::Velocity), [2.0, -0.25, 0.75, 0.0]);
+        assert_eq!(command(ActionSpace::VelocityYaw), [2.0, -0.25, 0.75, -1.0]);
     }
 
     #[test]

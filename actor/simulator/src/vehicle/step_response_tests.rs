@@ -6,13 +6,22 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::{Preset, Vehicle, VehicleSettings, VehicleState};
+use super::{Command, Preset, Vehicle, VehicleSettings, VehicleState};
 use crate::course::test_course;
 use crate::world::World;
 
 /// Returns the step length, s, and the state after every physics step under a constant
 /// `velocity_mps`, from hover at mid-height. Walls are ignored.
 fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<VehicleState>) {
+    let command = Command {
+        velocity_mps,
+        yaw_rate_radps: 0.0,
+    };
+    turn(preset, &command, secs)
+}
+
+/// As [`fly`], under a constant `command`.
+fn turn(preset: Preset, command: &Command, secs: f32) -> (f32, Vec<VehicleState>) {
     let settings = VehicleSettings {
         preset,
         ..Default::default()
@@ -20,10 +29,10 @@ fn fly(preset: Preset, velocity_mps: Vector3<f32>, secs: f32) -> (f32, Vec<Vehic
     let (_, dt_secs) = settings.physics_steps();
     let mut vehicle = Vehicle::trimmed(&settings);
     let mut world = World::new(&test_course(), vehicle.body(), dt_secs).unwrap();
-    world.reset(&Point3::new(1.5, 0.0, 3.5), 1.0);
+    world.reset(&Point3::new(1.5, 0.0, 3.5), 1.0, 0);
     let states = (0..(secs / dt_secs) as usize)
         .map(|_| {
-            let actuation = vehicle.actuate(&world.state(), &velocity_mps, dt_secs);
+            let actuation = vehicle.actuate(&world.state(), command, dt_secs);
             world.advance(&actuation, None);
             world.state()
         })
@@ -167,6 +176,38 @@ fn yaw_returns_to_zero_after_tilting_both_ways_to_the_limit() {
         .2
         .to_degrees();
     assert!(yaw_deg.abs() < 0.1, "{yaw_deg}");
+}
+
+#[test]
+fn a_commanded_turn_is_flown_and_the_velocity_turns_with_the_nose() {
+    for preset in [Preset::Airsim, Preset::Hummingbird, Preset::Point] {
+        for rate_radps in [1.0, -1.0] {
+            let command = Command {
+                velocity_mps: Vector3::new(0.5, 0.0, 0.0),
+                yaw_rate_radps: rate_radps,
+            };
+            // More than a whole turn: the heading passes ±π.
+            let (dt_secs, states) = turn(preset, &command, 8.0);
+            let yaw_rad = |secs: f32| {
+                let state = &states[(secs / dt_secs) as usize];
+                state.world_from_body.euler_angles().2
+            };
+            // In 6.28 s, a whole turn.
+            let missing_rad = (yaw_rad(7.8) - yaw_rad(7.8 - std::f32::consts::TAU)).abs();
+            assert!(missing_rad < 0.03, "{preset:?}: {missing_rad}");
+            let half_turn =
+                (yaw_rad(4.0) - yaw_rad(4.0 - std::f32::consts::FRAC_PI_2)) * rate_radps;
+            let quarter_rad = half_turn.rem_euclid(std::f32::consts::TAU);
+            assert!(
+                (quarter_rad - std::f32::consts::FRAC_PI_2).abs() < 0.03,
+                "{preset:?}: {quarter_rad}"
+            );
+            // The drone flies where it looks, but for the lag: not along the corridor.
+            let state = &states[(std::f32::consts::PI / dt_secs) as usize];
+            assert!(state.heading_velocity_mps().x > 0.2, "{preset:?}");
+            assert!(state.velocity_mps.x < 0.0, "{preset:?}");
+        }
+    }
 }
 
 #[test]

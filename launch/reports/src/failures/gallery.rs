@@ -15,6 +15,7 @@ use skein_simulator::course::{Course, DRONE_WIDTH_M, Wall};
 use super::{Failure, FlownEpisode};
 use crate::ReportError;
 use crate::canvas::{Area, Canvas, GRID, INK, STRONG, font, px};
+use crate::obstacles::draw_obstacles;
 use crate::trajectories::{CORRIDOR, WALL, colour_of, open_in_cut_m, plural};
 
 /// Most groups in one picture.
@@ -111,10 +112,17 @@ impl Group<'_> {
         self.episodes.iter().copied().take(IN_A_ROW)
     }
 
+    fn is_in_a_world(&self) -> bool {
+        self.episodes
+            .iter()
+            .any(|episode| episode.course.is_world())
+    }
+
     fn heading(&self) -> String {
         let at = match (self.failure, self.shape) {
             (Failure::HitWall, Some(shape)) => format!(", opening: {shape}"),
             (_, Some(shape)) => format!(", before an opening: {shape}"),
+            (_, None) if self.is_in_a_world() => String::new(),
             (_, None) => ", behind the last wall".to_owned(),
         };
         let others = match self.episodes.len() > IN_A_ROW {
@@ -284,6 +292,10 @@ impl<'a> Tile<'a> {
         let (from_m, to_m) = (self.end_m[0] - LAST_M - BACK_M, self.end_m[0] + BEYOND_M);
         let frame = [self.above(to_m, half_m), self.above(from_m, -half_m)];
         area.draw(&Rectangle::new(frame, CORRIDOR.filled()))?;
+        let within = |[x_m, y_m, _]: [f32; 3]| {
+            self.above(x_m.clamp(from_m, to_m), y_m.clamp(-half_m, half_m))
+        };
+        draw_obstacles(area, self.course(), 0, within)?;
         for wall in self.course().walls() {
             let front_m = wall.x_m().max(from_m);
             let back_m = (wall.x_m() + self.course().wall_thickness_m()).min(to_m);

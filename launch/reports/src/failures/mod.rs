@@ -42,6 +42,7 @@ impl FlownEpisode<'_> {
     fn failure(&self) -> Option<Failure> {
         match (self.outcome, self.hit_wall) {
             (Outcome::ReachedEnd, _) => None,
+            (Outcome::Collided, Some(_)) if self.course.is_world() => Some(Failure::HitObstacle),
             (Outcome::Collided, Some(_)) => Some(Failure::HitWall),
             (Outcome::Collided, None) => Some(Failure::HitCorridor),
             (Outcome::TimedOut, _) => Some(Failure::TimedOut),
@@ -65,6 +66,8 @@ impl FlownEpisode<'_> {
 enum Failure {
     /// It hit a wall or the edge of its opening.
     HitWall,
+    /// It hit an obstacle of a world.
+    HitObstacle,
     /// It hit a side, the floor or the ceiling of the corridor.
     HitCorridor,
     /// It reached the step limit.
@@ -75,6 +78,7 @@ impl Failure {
     fn name(self) -> &'static str {
         match self {
             Self::HitWall => "hit the wall",
+            Self::HitObstacle => "hit an obstacle",
             Self::HitCorridor => "hit the corridor",
             Self::TimedOut => "timed out",
         }

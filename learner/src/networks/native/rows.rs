@@ -1,18 +1,17 @@
 //! Row operations that every actor-critic needs, and the step of a target network.
 
 use skein_kernels::{Isa, Team, exp};
-use skein_protocol::ACTION;
 
 /// Q estimates per row of a critic.
 pub const ESTIMATES: usize = 2;
 
-/// Concatenates observations and actions row by row.
-pub fn join(observations: &[f32], actions: &[f32], into: &mut [f32]) {
-    let rows = actions.len() / ACTION;
+/// Concatenates observations and actions row by row. An action has `action` numbers.
+pub fn join(observations: &[f32], actions: &[f32], action: usize, into: &mut [f32]) {
+    let rows = actions.len() / action;
     let (observation, width) = (observations.len() / rows, into.len() / rows);
     for (row, into) in into.chunks_exact_mut(width).enumerate() {
         into[..observation].copy_from_slice(&observations[row * observation..][..observation]);
-        into[observation..].copy_from_slice(&actions[row * ACTION..][..ACTION]);
+        into[observation..].copy_from_slice(&actions[row * action..][..action]);
     }
 }
 

@@ -4,12 +4,13 @@ mod end_to_end;
 mod model;
 
 use std::convert::Infallible;
+use std::path::Path;
 
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_protocol::config::{CriticInput, Observation};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{CRITIC_STATE, GROUND_TRUTH, IMAGE_PIXELS};
+use skein_protocol::{ActionSpace, GROUND_TRUTH, IMAGE_PIXELS, MAX_ACTION, critic_state};
 
 use super::*;
 use crate::episode::samples::{code, episode, shade, with_images};
@@ -63,7 +64,7 @@ fn a_minibatch_holds_the_configured_share_of_success() {
         assert_eq!((batch.rewards.len(), marked), (count, success));
         assert_eq!(batch.observations.len(), count * LATENT);
         assert_eq!(batch.next_observations.len(), count * LATENT);
-        assert_eq!(batch.actions.len(), count * ACTION);
+        assert_eq!(batch.actions.len(), count * 2);
         assert_eq!(batch.terminated.len(), count);
     }
 }
@@ -79,7 +80,7 @@ fn in_segments(episode: &CommittedEpisode, steps: usize) -> Vec<CommittedEpisode
             first_step: first,
             action_before: first
                 .checked_sub(1)
-                .map_or([0.0; ACTION], |before| episode.actions[before]),
+                .map_or([0.0; MAX_ACTION], |before| episode.actions[before]),
             observations: episode.observations[first..=end].to_vec(),
             actions: episode.actions[first..end].to_vec(),
             teacher_actions: episode.teacher_actions[first..end].to_vec(),
@@ -225,23 +226,36 @@ fn a_minibatch_is_a_function_of_content_and_seed() {
 
 #[test]
 fn rows_of_a_minibatch_belong_together() {
-    let mut config = config(100, Observation::LatentVelocityAction);
-    config.learning.critic_input = CriticInput::GroundTruth;
-    let mut replay = frozen(&config);
-    for number in 0..20 {
-        replay
-            .insert(episode(number, 9, Outcome::Collided))
+    for action in ActionSpace::ALL {
+        let mut config = config(100, Observation::LatentVelocityAction);
+        config.learning.critic_input = CriticInput::GroundTruth;
+        let action = format!("simulator.vehicle.action={}", action.name());
+        let config = config
+            .overridden(Path::new("config.toml"), &[action])
             .unwrap();
+        let mut replay = frozen(&config);
+        for number in 0..20 {
+            replay
+                .insert(episode(number, 9, Outcome::Collided))
+                .unwrap();
+        }
+        let mut batch = Minibatch::default();
+        replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
+        assert_rows_belong_together(&config, &batch);
     }
-    let mut batch = Minibatch::default();
-    replay.sample(&mut Pcg64Mcg::seed_from_u64(1), 64, &mut batch);
-    let width = config.observation_layout().len();
+}
+
+fn assert_rows_belong_together(config: &Config, batch: &Minibatch) {
+    let (view, action) = (config.observation_layout(), config.action_space());
+    let (width, numbers, state_len) = (view.len(), action.numbers(), critic_state(action));
+    // The episodes' velocity forward never changes.
+    let left = LATENT + view.velocity_len() - 2;
     for index in 0..64 {
-        let observation = &batch.observations[index * width..(index + 1) * width];
-        let next = &batch.next_observations[index * width..(index + 1) * width];
-        let at = observation[LATENT] - 0.25;
+        let observation = &batch.observations[index * width..][..width];
+        let next = &batch.next_observations[index * width..][..width];
+        let at = observation[left] - 0.25;
         assert_eq!(
-            next[LATENT],
+            next[left],
             at + 1.25,
             "the next observation is one step later in the same episode"
         );
@@ -250,21 +264,21 @@ fn rows_of_a_minibatch_belong_together() {
             (&batch.critic_states, observation),
             (&batch.next_critic_states, next),
         ] {
-            let state = &states[index * CRITIC_STATE..][..CRITIC_STATE];
+            let state = &states[index * state_len..][..state_len];
             assert_eq!(
                 state[GROUND_TRUTH + 1..GROUND_TRUTH + 3],
-                seen[LATENT..LATENT + 2],
+                seen[left..left + 2],
                 "the critic sees the same moment"
             );
             assert_eq!(
-                state[GROUND_TRUTH + 5..],
-                seen[LATENT + 2..],
+                state[state_len - numbers..],
+                seen[left + 2..],
                 "and the action before it"
             );
         }
         assert_eq!(
-            batch.actions[2 * index..2 * index + 2],
-            next[LATENT + 2..],
+            batch.actions[numbers * index..][..numbers],
+            next[left + 2..],
             "the present action is the previous one of the next observation"
         );
         assert_eq!(batch.terminated[index] == 1.0, at % 1000.0 == 8.0);

@@ -16,7 +16,7 @@ use crate::episode::samples::{episode, with_images};
 struct Transition {
     observation: Vec<f32>,
     next_observation: Vec<f32>,
-    action: [f32; ACTION],
+    action: [f32; 2],
     reward: f32,
     terminated: f32,
 }
@@ -26,6 +26,11 @@ struct Model {
     parts: [(VecDeque<Transition>, usize); 2],
     view: ObservationLayout,
     section: ReplaySection,
+}
+
+fn lateral(episode: &CommittedEpisode, step: usize) -> [f32; 2] {
+    let [left, up, ..] = episode.actions[step];
+    [left, up]
 }
 
 impl Model {
@@ -50,7 +55,7 @@ impl Model {
                     vector.extend(if step == 0 {
                         [0.0; 2]
                     } else {
-                        episode.actions[step - 1]
+                        lateral(episode, step - 1)
                     });
                 }
                 vector
@@ -66,7 +71,7 @@ impl Model {
             let transition = Transition {
                 observation: observed(step),
                 next_observation: observed(step + 1),
-                action: episode.actions[step],
+                action: lateral(episode, step),
                 reward: episode.rewards[step],
                 terminated: if ends { 1.0 } else { 0.0 },
             };

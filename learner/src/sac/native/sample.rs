@@ -6,18 +6,19 @@
 use std::f32::consts::LN_2;
 
 use skein_kernels::{Isa, exp};
-use skein_protocol::{ACTION, LOG_STD};
+use skein_protocol::LOG_STD;
 
 use crate::networks::native::squash;
 
-/// Policy outputs per row: the means, then the logarithms of the standard deviations.
-const OUTPUTS: usize = 2 * ACTION;
 /// ½ ln 2π.
 const HALF_LN_TAU: f32 = 0.918_938_5;
 
-/// Actions drawn for rows of observations. All fields but `log_prob` are `[rows, 2]`.
+/// Actions drawn for rows of observations. All fields but `action` and `log_prob` are
+/// `[rows, action]`.
 #[derive(Debug, Default)]
 pub(super) struct Sample {
+    /// Numbers of an action.
+    action: usize,
     /// Standard normal noise; the caller fills it before [`Sample::draw`].
     pub(super) noise: Vec<f32>,
     /// Mean of the normal distribution before tanh.
@@ -37,10 +38,11 @@ pub(super) struct Sample {
 }
 
 impl Sample {
-    /// Allocates buffers for `rows` rows.
-    pub(super) fn allocate(rows: usize) -> Self {
-        let element = || vec![0.0; rows * ACTION];
+    /// Allocates buffers for `rows` actions of `action` numbers.
+    pub(super) fn allocate(rows: usize, action: usize) -> Self {
+        let element = || vec![0.0; rows * action];
         Self {
+            action,
             noise: element(),
             mean: element(),
             log_std: element(),
@@ -53,16 +55,18 @@ impl Sample {
     }
 
     /// Draws a = tanh(x), x = mean + std · noise, and computes log π(a) (arXiv:1812.05905, eq. 26).
-    /// `output`: the policy network's, `[rows, 4]`.
+    /// `output`: the policy network's, `[rows, 2 · action]`: in each row the means, then the logarithms
+    /// of the standard deviations.
     pub(super) fn draw(&mut self, isa: Isa, output: &[f32]) {
-        let rows = output.chunks_exact(OUTPUTS);
+        let action = self.action;
+        let rows = output.chunks_exact(2 * action);
         let own = self
             .mean
-            .chunks_exact_mut(ACTION)
-            .zip(self.log_std.chunks_exact_mut(ACTION));
+            .chunks_exact_mut(action)
+            .zip(self.log_std.chunks_exact_mut(action));
         for (row, (mean, log_std)) in rows.zip(own) {
-            mean.copy_from_slice(&row[..ACTION]);
-            log_std.copy_from_slice(&row[ACTION..]);
+            mean.copy_from_slice(&row[..action]);
+            log_std.copy_from_slice(&row[action..]);
         }
         let Self {
             noise,
@@ -97,15 +101,15 @@ impl Sample {
                 }
             },
         );
-        let elements = self.element_log_prob.chunks_exact(ACTION);
+        let elements = self.element_log_prob.chunks_exact(action);
         for (log_prob, elements) in self.log_prob.iter_mut().zip(elements) {
             *log_prob = elements.iter().sum();
         }
     }
 
-    /// Computes the gradient with respect to the policy network's output, `[rows, 4]`, for the rows
+    /// Computes the gradient with respect to the policy network's output, `[rows, 2 · action]`, for the rows
     /// after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to each
-    /// log π, and `action_grad`, `[rows, 2]`, with respect to the actions.
+    /// log π, and `action_grad`, `[rows, action]`, with respect to the actions.
     ///
     /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1; ∂x/∂log_std = std · noise; log_std
     /// also enters log π directly, ∂log π/∂log_std = -1. No gradient passes a bound of log_std.
@@ -116,14 +120,15 @@ impl Sample {
         action_grad: &[f32],
         into: &mut [f32],
     ) {
-        for (row, into) in into.chunks_exact_mut(OUTPUTS).enumerate() {
-            for dimension in 0..ACTION {
-                let at = (skipped + row) * ACTION + dimension;
-                let by_action = action_grad[row * ACTION + dimension];
+        let action = self.action;
+        for (row, into) in into.chunks_exact_mut(2 * action).enumerate() {
+            for dimension in 0..action {
+                let at = (skipped + row) * action + dimension;
+                let by_action = action_grad[row * action + dimension];
                 let by_x = log_prob_gradient * 2.0 * self.actions[at] + by_action * self.slope[at];
                 into[dimension] = by_x;
                 let free = (LOG_STD.0..=LOG_STD.1).contains(&self.log_std[at]);
-                into[ACTION + dimension] = if free {
+                into[action + dimension] = if free {
                     by_x * self.deviation[at] - log_prob_gradient
                 } else {
                     0.0

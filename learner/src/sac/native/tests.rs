@@ -1,5 +1,6 @@
 //! Native against libtorch, number by number; neither threads nor instructions change a bit.
 
+use skein_protocol::ActionSpace;
 use skein_protocol::config::TeacherName;
 use tch::Device;
 
@@ -114,13 +115,15 @@ fn assert_one_update_is_equal(
 #[test]
 fn gradients_and_one_update_are_the_references() {
     // `critic_width`: width of the critic's own input, if it has one.
-    for (number, (observation, critic_width)) in OBSERVATIONS
+    for (number, ((observation, critic_width), action)) in OBSERVATIONS
         .into_iter()
         .zip([None, Some(5), Some(50)])
+        .zip(ActionSpace::ALL)
         .enumerate()
     {
         let inputs = Inputs {
             critic: critic_width.unwrap_or(observation),
+            action,
             ..Inputs::same(observation)
         };
         for (width, rows) in [
@@ -139,12 +142,12 @@ fn gradients_and_one_update_are_the_references() {
             };
             let (mut native, mut torch) = both(&section, inputs, seed);
             let mut noise = Noise::new(seed);
-            let mut transitions = Transitions::random(observation, rows, &mut noise);
+            let mut transitions = Transitions::random_for(inputs, rows, &mut noise);
             if let Some(critic_width) = critic_width {
                 transitions = transitions.with_critic_states(critic_width, &mut noise);
             }
             let context = format!(
-                "{observation} seen, width {width}, {rows} rows, {} networks",
+                "{observation} seen, {action:?}, width {width}, {rows} rows, {} networks",
                 section.critic_networks
             );
             assert_one_update_is_equal(&mut native, &mut torch, &transitions, &context);

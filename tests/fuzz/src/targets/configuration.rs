@@ -75,7 +75,7 @@ pub(super) const EXPERIMENT: Target = Target {
 /// Returns the shipped experiments, with the path of their base configuration on this machine.
 fn experiment_samples() -> Vec<Vec<u8>> {
     let configs = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/");
-    ["paper", "success-share", "vae-freeze", "open-view"]
+    ["paper", "success-share", "vae-freeze", "rivals"]
         .map(|name| shipped(&format!("configs/experiments/{name}.toml")))
         .map(|bytes| {
             String::from_utf8(bytes)

@@ -1,4 +1,4 @@
-//! Courses: from a file, from a layout that a file may describe, and drawn from ranges. An accepted
+//! Courses and worlds: from a file, from a layout that a file may describe, and drawn from ranges. An accepted
 //! course can be flown from every level.
 
 use std::sync::Arc;
@@ -19,7 +19,7 @@ use crate::script::Script;
 
 pub(super) const FILE: Target = Target {
     name: "course_file",
-    reads: "course files",
+    reads: "course files and world files",
     longest_bytes: 8192,
     weight: USUAL,
     samples: file_samples,
@@ -109,7 +109,9 @@ fn file_samples() -> Vec<Vec<u8>> {
         "non_rectangular",
     ]
     .map(|name| shipped(&format!("configs/courses/{name}.toml")))
-    .to_vec()
+    .into_iter()
+    .chain(["apartment", "hall"].map(|name| shipped(&format!("configs/worlds/{name}.toml"))))
+    .collect()
 }
 
 /// Returns scripts whose choices are all average, or random.
@@ -319,5 +321,6 @@ fn ranges(script: &mut Script<'_>) -> GeneratorRanges {
         clearance_m,
         rotation_deg,
         layout: None,
+        worlds: Vec::new(),
     }
 }

@@ -7,8 +7,9 @@ use std::sync::LazyLock;
 use bytemuck::Zeroable;
 use mcap::records::MessageHeader;
 use mcap::{MessageStream, WriteOptions};
+use skein_protocol::ActionSpace;
 use skein_protocol::evaluation::EpisodeScore;
-use skein_protocol::transition::{Outcome, TransitionRecord};
+use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
 use skein_recordings::{Episode, Recording, images, read};
 use skein_simulator::course::Course;
 use skein_simulator::simulator::SimulatorSettings;
@@ -36,6 +37,11 @@ pub(super) const FILE: Target = Target {
 
 const TOPICS: [&str; 4] = ["/scene", "/events", "/camera/image", "/drone/step"];
 
+const LENGTHS: RecordLengths = RecordLengths {
+    latent: 8,
+    action: ActionSpace::Velocity,
+};
+
 /// A recording of two steps.
 static SOUND: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let folder = tempfile::tempdir().unwrap();
@@ -46,12 +52,12 @@ static SOUND: LazyLock<Vec<u8>> = LazyLock::new(|| {
         "/../../configs/courses/training.toml"
     );
     let course = Course::load(course).unwrap();
-    let mut recording = Recording::create(&path, &settings, &["a course"]).unwrap();
+    let mut recording = Recording::create(&path, &settings, LENGTHS.action, &["a course"]).unwrap();
     let episode = Episode {
         title: "an episode",
         course: (&course, 0),
         number: 0,
-        latent: 8,
+        lengths: LENGTHS,
         score: EpisodeScore {
             walls_passed: 0,
             walls: 1,

@@ -9,6 +9,7 @@ use bytemuck::{Zeroable, bytes_of_mut};
 use skein_learner::episode::CommittedEpisode;
 use skein_learner::episodes::assembly::KeptData;
 use skein_learner::episodes::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder};
+use skein_protocol::ActionSpace;
 use skein_protocol::config::TransportSection;
 use skein_protocol::ids::{
     ActorId, ActorIncarnation, Attempt, EpisodeId, Epoch, PolicyVersion, RunId,
@@ -16,7 +17,7 @@ use skein_protocol::ids::{
 use skein_protocol::stages::StageTimes;
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
 use skein_protocol::ticket::{Control, CourseChoice, Exploration, Ticket};
-use skein_protocol::transition::{Outcome, RecordKind, TransitionRecord};
+use skein_protocol::transition::{Outcome, RecordKind, RecordLengths, TransitionRecord};
 
 use super::signals::pod;
 use super::{ReaderDecision, Target, USUAL};
@@ -38,6 +39,10 @@ const EPISODES: u64 = 6;
 const LONGEST_EPISODE: usize = 8;
 /// Length of the latent codes.
 const LATENT: usize = 16;
+const LENGTHS: RecordLengths = RecordLengths {
+    latent: LATENT,
+    action: ActionSpace::Lateral,
+};
 /// Number of bytes of a record before its image.
 const HEADER: usize = offset_of!(TransitionRecord, depth);
 
@@ -144,7 +149,7 @@ impl FuzzedLearner {
             max_records_per_episode: LONGEST_EPISODE,
             ..TransportSection::default()
         };
-        let mut dispatcher = Dispatcher::new(RUN, &limits, LATENT);
+        let mut dispatcher = Dispatcher::new(RUN, &limits, LENGTHS);
         for episode in 0..EPISODES {
             dispatcher.order(EpisodeOrder {
                 ticket: sample_ticket(episode),

@@ -10,7 +10,7 @@ use skein_learner::replay::{Minibatch, Replay, ReplayState, RingState};
 use skein_protocol::config::{Config, EncoderTraining};
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
-use skein_protocol::{ACTION, GROUND_TRUTH, IMAGE_PIXELS, MAX_LATENT, REWARD_TERMS};
+use skein_protocol::{GROUND_TRUTH, IMAGE_PIXELS, MAX_ACTION, MAX_LATENT, REWARD_TERMS};
 
 use super::{ReaderDecision, Target, USUAL};
 use crate::script::Script;
@@ -34,7 +34,7 @@ pub(super) const REPLAY: Target = Target {
 /// Length of the latent codes, the default.
 const LATENT: usize = 32;
 /// Values in a row of the smallest buffer: two observations, action, reward, end.
-const ROW: usize = 2 * LATENT + ACTION + 2;
+const ROW: usize = 2 * LATENT + 2 + 2;
 
 pub(super) fn config() -> Config {
     let mut config = Config::default();
@@ -139,10 +139,10 @@ pub(super) fn episode() -> CommittedEpisode {
         actor: ActorId(0),
         level: 1,
         first_step: 0,
-        action_before: [0.0; ACTION],
+        action_before: [0.0; MAX_ACTION],
         observations: vec![seen; 3],
-        actions: vec![[0.0; ACTION]; 2],
-        teacher_actions: vec![[0.0; ACTION]; 2],
+        actions: vec![[0.0; MAX_ACTION]; 2],
+        teacher_actions: vec![[0.0; MAX_ACTION]; 2],
         rewards: vec![1.0; 2],
         reward_terms: vec![[0.0; REWARD_TERMS]; 2],
         level_up: vec![false, true],

@@ -48,7 +48,7 @@ fn signal_samples() -> Vec<Vec<u8>> {
     let ticket = sample_ticket(5);
     let segment = Segment {
         steps: 1,
-        prior_actions: vec![[0.5, -1.0]; 3].into(),
+        prior_actions: vec![[0.5, -1.0, 0.25, 0.0]; 3].into(),
     };
     vec![
         bytes_of(&SegmentRecord::fly(

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{RangesError, check_range};
 use crate::course::check::{LARGEST_M, NEAR_MIDDLE_M, SETTLING_M};
-use crate::course::{BODY_CLEARANCE_M, Corridor, MAX_WALLS, StartArea};
+use crate::course::{BODY_CLEARANCE_M, Corridor, MAX_WALLS, Sidestep, StartArea};
+use crate::oracle::{HOVER_BEHIND_START_M, HOVER_BEHIND_WALL_M};
 use crate::text::exactly;
 
 /// Ranges for corridors: section `[simulator.generator.layout]`. Every key has a least and a
@@ -44,6 +45,10 @@ pub struct LayoutRanges {
     /// `start.jitter_z_m` of a course. Default 0.5.
     #[serde(deserialize_with = "exactly")]
     pub start_jitter_z_m: [f32; 2],
+    /// `true` puts the openings in turn into the left and the right half of the corridor. The walls
+    /// may then stand too close for a drone that flies on at 1 m/s: 1.7 m from back to front, where
+    /// one that hovers has room. Such courses need `vehicle.action = "velocity"`. Default false.
+    pub slalom: bool,
 }
 
 impl Default for LayoutRanges {
@@ -58,6 +63,7 @@ impl Default for LayoutRanges {
             start_offset_m: [1.5; 2],
             start_jitter_y_m: [0.5; 2],
             start_jitter_z_m: [0.5; 2],
+            slalom: false,
         }
     }
 }
@@ -69,6 +75,35 @@ pub(super) struct Layout {
     pub(super) start: StartArea,
     pub(super) wall_x_m: Vec<f32>,
     pub(super) wall_thickness_m: f32,
+    /// Half of the corridor in which a slalom's first opening lies; `None` for any other course.
+    pub(super) slalom: Option<Half>,
+}
+
+/// Half of a corridor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Half {
+    Left,
+    Right,
+}
+
+impl Layout {
+    /// Returns how the drone gets from one opening to the next.
+    pub(super) fn sidestep(&self) -> Sidestep {
+        match self.slalom {
+            Some(_) => Sidestep::Hovering,
+            None => Sidestep::Flying,
+        }
+    }
+
+    /// Returns the range along y for the centre of the opening of the wall at `place`, metres.
+    pub(super) fn across_m(&self, place: usize) -> [f32; 2] {
+        let half_m = self.corridor.width_m / 2.0;
+        match (self.slalom, place.is_multiple_of(2)) {
+            (None, _) => [-half_m, half_m],
+            (Some(Half::Left), true) | (Some(Half::Right), false) => [0.0, half_m],
+            (Some(Half::Right), true) | (Some(Half::Left), false) => [-half_m, 0.0],
+        }
+    }
 }
 
 impl LayoutRanges {
@@ -77,7 +112,14 @@ impl LayoutRanges {
         let [least_walls, most_walls] = self.walls.map(f32::from);
         let thickest_m = self.wall_thickness_m[1];
         let widest_jitter_m = self.start_jitter_y_m[1].max(self.start_jitter_z_m[1]);
-        let before_wall_m = self.start_offset_m[1] + widest_jitter_m + SETTLING_M + NEAR_MIDDLE_M;
+        let least_spacing_m = match self.slalom {
+            false => {
+                let aside_m = SETTLING_M + NEAR_MIDDLE_M;
+                (self.start_offset_m[1] + widest_jitter_m + aside_m).max(thickest_m + aside_m)
+            }
+            true => (self.start_offset_m[1] + HOVER_BEHIND_START_M)
+                .max(thickest_m + HOVER_BEHIND_WALL_M),
+        };
         let jitter_m = |section_m: [f32; 2]| section_m[0] / 2.0 - BODY_CLEARANCE_M;
         for (key, range, smallest, largest) in [
             ("layout.width_m", self.width_m, 2.0, 100.0),
@@ -116,7 +158,7 @@ impl LayoutRanges {
             (
                 "layout.spacing_m",
                 self.spacing_m,
-                before_wall_m.max(thickest_m + SETTLING_M + NEAR_MIDDLE_M),
+                least_spacing_m,
                 (LARGEST_M - self.end_m[1]) / most_walls,
             ),
         ] {
@@ -144,7 +186,12 @@ impl LayoutRanges {
                 front_m
             })
             .collect();
+        let slalom = self.slalom.then(|| match rng.random() {
+            true => Half::Left,
+            false => Half::Right,
+        });
         Layout {
+            slalom,
             corridor: Corridor {
                 length_m: front_m + end_m,
                 width_m,
@@ -170,6 +217,7 @@ impl LayoutRanges {
             start_offset_m: most(self.start_offset_m),
             start_jitter_y_m: most(self.start_jitter_y_m),
             start_jitter_z_m: most(self.start_jitter_z_m),
+            slalom: self.slalom,
         }
     }
 

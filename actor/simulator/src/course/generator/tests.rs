@@ -101,6 +101,7 @@ fn varied() -> GeneratorRanges {
             start_offset_m: [1.2, 1.8],
             start_jitter_y_m: [0.2, 0.5],
             start_jitter_z_m: [0.2, 0.5],
+            slalom: false,
         }),
         ..Default::default()
     }
