@@ -1,4 +1,5 @@
-//! Scene that a viewer draws in 3-D: the corridor, its walls, still obstacles, the drone and its trail, the frames.
+//! Scene that a viewer draws in 3-D: the corridor, its walls, still obstacles, the drone and its
+//! trail, the frames.
 
 use skein_protocol::transition::TransitionRecord;
 use skein_simulator::camera::CameraSettings;
