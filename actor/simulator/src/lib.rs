@@ -11,7 +11,7 @@
 //! |---|---|
 //! | [`simulator`] | [`Simulator`](simulator::Simulator): `reset`, `step`, `render` |
 //! | [`reward`] | the four terms of the reward and their sizes |
-//! | [`course`] | corridors with walls and openings, worlds of obstacles; their files; random ones |
+//! | [`course`] | corridors with walls and openings, worlds of obstacles; files; random ones |
 //! | [`vehicle`] | drone presets and their flight controller |
 //! | [`camera`] | depth image, with or without a stereo camera's errors |
 //! | [`disturbances`] | gusts, latency, mass, depth noise |

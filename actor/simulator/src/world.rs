@@ -5,8 +5,8 @@
 //! inside is a box, so the cuboid's bounds decide whether it touches that; a wall is tested,
 //! triangle by triangle, only while the bounds reach into it. The body moves centimetres a step and
 //! is longer than that in every direction it can move, so it cannot pass a surface between two
-//! tests. Obstacles that stand still are one set of triangles in a tree of boxes. A moving one keeps
-//! its triangles: the body is seen from it.
+//! tests. Obstacles that stand still are one set of triangles in a tree of boxes. A moving one
+//! keeps its triangles: the body is seen from it.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use rapier3d::math::{Pose, Rotation};

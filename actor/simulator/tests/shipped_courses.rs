@@ -1,4 +1,4 @@
-//! Checks the claims of the comments in `configs/courses/`.
+//! Checks the claims of the comments in `configs/courses/` and `configs/worlds/`.
 
 use std::path::{Path, PathBuf};
 

@@ -32,8 +32,8 @@ pub enum PrepareError {
     Course(#[from] CourseError),
     /// A mesh file that a run cannot keep a copy of under its name.
     #[error(
-        "{}: file = {file:?}: a run keeps copies of all mesh files in one folder: put the file beside \
-         the course, under a name that no other course of the run uses for another mesh",
+        "{}: file = {file:?}: a run keeps copies of all mesh files in one folder: put the file \
+         beside the course, under a name that no other course of the run uses for another mesh",
         course.display()
     )]
     MeshFile {

@@ -8,8 +8,8 @@
 //! a row of 128 bits at once, so that holes and inward corners need no triangles. Two surfaces that
 //! share an edge compute the same pixel for it, so no crack opens between them.
 //!
-//! An obstacle has many small convex faces. Such a face has one run of pixels in each row, between the
-//! same edges, which costs a fraction of that.
+//! An obstacle has many small convex faces. Such a face has one run of pixels in each row, between
+//! the same edges, which costs a fraction of that.
 
 use super::settings::MIDDLE_PX;
 use super::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
@@ -68,8 +68,8 @@ pub(super) struct DepthCanvas {
     /// First row that the outline touches.
     first_row: usize,
     end_row: usize,
-    /// Where the edges of a convex face cross the middle of each row, columns: the first crossing and
-    /// the last one. Meaningful only within [`Self::fill_convex`].
+    /// Where the edges of a convex face cross the middle of each row, columns: the first crossing
+    /// and the last one. Meaningful only within [`Self::fill_convex`].
     left: [f32; IMAGE_HEIGHT],
     right: [f32; IMAGE_HEIGHT],
     /// The same, as the first pixel of each row in the face and the first behind it.
@@ -133,19 +133,25 @@ impl DepthCanvas {
         self.end_row = 0;
     }
 
-    /// Draws a plane into a convex outline where it is the nearest so far. `plane` is asked for only if
-    /// a row is met.
+    /// Draws a plane into a convex outline where it is the nearest so far. `plane` is asked for
+    /// only if a row is met.
     #[inline(always)]
     pub(super) fn fill_convex(&mut self, corners: &[ImagePoint], plane: impl Fn() -> Nearness) {
-        let rows = corners.iter().map(|corner| corner.row);
-        let (top, bottom) = rows.fold((f32::INFINITY, f32::NEG_INFINITY), |(least, most), row| {
-            (least.min(row), most.max(row))
-        });
-        let first = first_at_or_after(top, IMAGE_HEIGHT);
-        let end = first_at_or_after(bottom, IMAGE_HEIGHT);
-        let Some(&last) = corners.last().filter(|_| first < end) else {
+        let Some(&last) = corners.last() else { return };
+        let (mut least, mut most) = (last, last);
+        for corner in corners {
+            least.row = least.row.min(corner.row);
+            least.column = least.column.min(corner.column);
+            most.row = most.row.max(corner.row);
+            most.column = most.column.max(corner.column);
+        }
+        let first = first_at_or_after(least.row, IMAGE_HEIGHT);
+        let end = first_at_or_after(most.row, IMAGE_HEIGHT);
+        let columns = [least, most].map(|corner| first_at_or_after(corner.column, IMAGE_WIDTH));
+        // Most triangles of a fine mesh lie between the middles of pixels.
+        if first >= end || columns[0] >= columns[1] {
             return;
-        };
+        }
         self.left[first..end].fill(f32::INFINITY);
         self.right[first..end].fill(f32::NEG_INFINITY);
         let mut from = last;
@@ -251,8 +257,17 @@ fn raise_short(
 /// Returns the first pixel whose middle lies at or after `position`, at most `count`.
 #[inline(always)]
 fn first_at_or_after(position: f32, count: usize) -> usize {
+    let (from_start, count_px) = (position - 0.5, count as f32);
+    // Written so that a NaN becomes 0.
+    let at_least_0 = if from_start > 0.0 { from_start } else { 0.0 };
+    let within = if at_least_0 < count_px {
+        at_least_0
+    } else {
+        count_px
+    };
     // Equals `ceil` without its call: truncation rounds down, and counted from the far end, up.
-    let from_end = count as f32 + 1.0 - (position - 0.5).clamp(0.0, count as f32);
-    // By way of `i32`, which costs one instruction where `usize` costs several.
-    count + 1 - from_end as i32 as usize
+    let from_end = count_px + 1.0 - within;
+    // SAFETY: it lies between 1 and `count` + 1. A conversion that checks costs several times as
+    // much.
+    count + 1 - unsafe { from_end.to_int_unchecked::<i32>() } as usize
 }

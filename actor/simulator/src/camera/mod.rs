@@ -2,8 +2,9 @@
 //!
 //! The image is the planar depth (along the optical axis, not along the ray) in 8 bits. It is
 //! drawn, not traced: every surface of a course is flat, so a frame costs some hundred edges and a
-//! few thousand vector operations. A tree of boxes keeps what is out of sight from costing anything. [`ReferenceCamera`] traces the same surfaces ray by ray; a
-//! property test compares the two.
+//! few thousand vector operations. A tree of boxes keeps what is out of sight from costing
+//! anything. [`ReferenceCamera`] traces the same surfaces ray by ray; a property test compares the
+//! two.
 
 mod canvas;
 mod instructions;

@@ -1,8 +1,8 @@
 //! A course's surfaces, prepared for drawing.
 //!
-//! Surfaces are grouped into parts, and a tree of boxes holds the parts: whatever is out of sight is
-//! passed over, a whole branch at a time. A part that moves has its own coordinates, in which the
-//! camera moves instead.
+//! Surfaces are grouped into parts, and a tree of boxes holds the parts: whatever is out of sight
+//! is passed over, a whole branch at a time. A part that moves has its own coordinates, in which
+//! the camera moves instead.
 
 use std::ops::Range;
 

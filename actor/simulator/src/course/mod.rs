@@ -1,5 +1,5 @@
-//! Courses: a corridor, its walls and their openings, in the order in which the drone meets them; or
-//! a world of obstacles between a start and a goal.
+//! Courses: a corridor, its walls and their openings, in the order in which the drone meets them;
+//! or a world of obstacles between a start and a goal.
 //!
 //! Every [`Course`] can be flown: [`Course::new`] refuses anything else and names the wall, the key
 //! and the remedy. So neither the physics nor the camera checks again. The drone sees and hits the
@@ -155,7 +155,8 @@ pub struct Wall {
     clearance_m: f32,
 }
 
-/// A corridor with walls, or a world of obstacles, that the drone can fly from the start to the end.
+/// A corridor with walls, or a world of obstacles, that the drone can fly from the start to the
+/// end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Course {
     name: String,
@@ -270,8 +271,8 @@ impl Course {
         self.corridor
     }
 
-    /// Returns the area in which episodes start. Of a world, only its offset has a meaning: the end of
-    /// a corridor lies as far behind it as the goal from the start.
+    /// Returns the area in which episodes start. Of a world, only its offset has a meaning: the end
+    /// of a corridor lies as far behind it as the goal from the start.
     #[must_use]
     pub fn start(&self) -> StartArea {
         self.start
@@ -315,8 +316,8 @@ impl Course {
         self.world.as_ref().map(|world| *world.goal())
     }
 
-    /// Returns the number of walls or stages that a drone at `position_m` with its tail at `tail_x_m`
-    /// has left: walls whose back face lies before its tail, or stages of the way.
+    /// Returns the number of walls or stages that a drone at `position_m` with its tail at
+    /// `tail_x_m` has left: walls whose back face lies before its tail, or stages of the way.
     pub(crate) fn walls_behind(&self, position_m: &Point3<f32>, tail_x_m: f32) -> usize {
         if let Some(world) = &self.world {
             return world.stages_behind(position_m);
@@ -343,8 +344,8 @@ impl Course {
         }
     }
 
-    /// Returns `true` if the end can be reached from `position_m`: in a world, the point lies inside
-    /// no obstacle.
+    /// Returns `true` if the end can be reached from `position_m`: in a world, the point lies
+    /// inside no obstacle.
     pub(crate) fn is_reachable(&self, position_m: &Point3<f32>) -> bool {
         let world = self.world.as_ref();
         world.is_none_or(|world| world.is_reachable(position_m))

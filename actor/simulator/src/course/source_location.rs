@@ -1,7 +1,7 @@
 //! Location of a parser error in a course file: line, wall or obstacle, and key.
 //!
-//! The parser reports a byte, but a user thinks in walls and obstacles. The search goes by lines instead of
-//! parsed tables, because a file that is not TOML still has walls and keys.
+//! The parser reports a byte, but a user thinks in walls and obstacles. The search goes by lines
+//! instead of parsed tables, because a file that is not TOML still has walls and keys.
 
 use std::ops::Range;
 

@@ -154,7 +154,8 @@ impl Simulator {
         } else {
             0
         });
-        let walls_behind = self.walls_left();
+        // In front of the wall, or in the stage, of its level.
+        let walls_behind = usize::from(level) - 1;
         self.episode = EpisodeState {
             phase: EpisodePhase::Flying,
             steps: 0,

@@ -1,5 +1,5 @@
-//! Courses and worlds: from a file, from a layout that a file may describe, and drawn from ranges. An accepted
-//! course can be flown from every level.
+//! Courses and worlds: from a file, from a layout that a file may describe, and drawn from ranges.
+//! An accepted course can be flown from every level.
 
 use std::sync::Arc;
 

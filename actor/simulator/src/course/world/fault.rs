@@ -140,8 +140,8 @@ pub enum WorldFault {
     },
     /// No way for the drone.
     #[error(
-        "course: no way of 1.2 m width and 0.6 m height leads from the middle of [start] to [goal]: \
-         move or remove an obstacle"
+        "course: no way of 1.2 m width and 0.6 m height leads from the middle of [start] to \
+         [goal]: move or remove an obstacle"
     )]
     NoWay,
     /// The goal is too near to the start.

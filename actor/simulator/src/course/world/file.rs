@@ -301,7 +301,7 @@ impl ObstacleTable {
                 let path = folder.join(keys.need("file", &mut self.file)?);
                 let scale = MeshScale {
                     factor: self.scale.take().unwrap_or(1.0),
-                    up: self.up.take(),
+                    up: self.up.take().unwrap_or(UpAxis::Z),
                     with_holes: self.with_holes.take().unwrap_or(false),
                 };
                 let mesh =

@@ -177,7 +177,7 @@ impl Default for GatesRanges {
 /// # Errors
 /// [`WorldFault`] if a range is invalid, or if no world drawn from the ranges can be flown.
 pub(in crate::course) fn generate(seed: u64, ranges: &WorldRanges) -> Result<Course, WorldFault> {
-    /// Of the densest forests of the default ranges, nearly all can be flown.
+    /// Nearly all of the densest forests of the default ranges can be flown.
     const MOST_RETRIES: u32 = 20;
 
     ranges.check()?;

@@ -1,4 +1,4 @@
-//! Mesh files: OBJ, STL and binary glTF.
+//! Mesh files: OBJ and STL.
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
@@ -22,8 +22,7 @@ const FLAT: f32 = 1e-6;
 pub(super) struct MeshScale {
     /// Metres of a unit of the file.
     pub(super) factor: f32,
-    /// `None`: as the format has it, y in glTF and z otherwise.
-    pub(super) up: Option<UpAxis>,
+    pub(super) up: UpAxis,
     /// Accepts a surface that is not closed.
     pub(super) with_holes: bool,
 }
@@ -37,10 +36,17 @@ type Triangles = (Vec<[f32; 3]>, Vec<[u32; 3]>);
 /// The problem and its remedy.
 pub(super) fn load(path: &Path, scale: MeshScale) -> Result<TriangleMesh, String> {
     let bytes = read_file(path, MOST_BYTES).map_err(|error| format!("cannot be read: {error}"))?;
-    let ((vertices, triangles), up) = match path.extension().and_then(OsStr::to_str) {
-        Some("glb") => (read_glb(&bytes)?, UpAxis::Y),
-        Some("obj" | "stl") => (read_obj_or_stl(&bytes, path)?, UpAxis::Z),
-        _ => return Err("is no .obj, .stl or .glb file: export it as one of them".to_owned()),
+    parse(&bytes, path, scale)
+}
+
+/// Reads a mesh from the bytes of a file; the end of `path` names its format.
+///
+/// # Errors
+/// As [`load`].
+pub(super) fn parse(bytes: &[u8], path: &Path, scale: MeshScale) -> Result<TriangleMesh, String> {
+    let (vertices, triangles) = match path.extension().and_then(OsStr::to_str) {
+        Some("obj" | "stl") => read_obj_or_stl(bytes, path)?,
+        _ => return Err("is no .obj or .stl file: export it as one of them".to_owned()),
     };
     if triangles.len() > MAX_TRIANGLES {
         return Err(format!(
@@ -49,7 +55,7 @@ pub(super) fn load(path: &Path, scale: MeshScale) -> Result<TriangleMesh, String
         ));
     }
     let placed = vertices.into_iter().map(|[x, y, z]| {
-        let upright = match scale.up.unwrap_or(up) {
+        let upright = match scale.up {
             UpAxis::Z => [x, y, z],
             UpAxis::Y => [x, -z, y],
         };
@@ -78,51 +84,6 @@ fn read_obj_or_stl(bytes: &[u8], path: &Path) -> Result<Triangles, String> {
                 .iter()
                 .map(|face| face.map(|corner| corner + first)),
         );
-    }
-    Ok((vertices, triangles))
-}
-
-/// Reads the scene of a binary glTF file, whose numbers are in the file itself. Its y axis is up.
-fn read_glb(bytes: &[u8]) -> Result<Triangles, String> {
-    let gltf = gltf::Gltf::from_slice(bytes).map_err(|error| format!("cannot be read: {error}"))?;
-    let (mut vertices, mut triangles) = (Vec::new(), Vec::new());
-    let scene = gltf.default_scene().or_else(|| gltf.scenes().next());
-    let mut nodes: Vec<_> = scene
-        .iter()
-        .flat_map(|scene| scene.nodes())
-        .map(|node| (node, nalgebra::Matrix4::<f32>::identity()))
-        .collect();
-    while let Some((node, parent)) = nodes.pop() {
-        let place = parent * nalgebra::Matrix4::from(node.transform().matrix());
-        nodes.extend(node.children().map(|child| (child, place)));
-        for primitive in node.mesh().iter().flat_map(|mesh| mesh.primitives()) {
-            if primitive.mode() != gltf::mesh::Mode::Triangles {
-                return Err("has lines, points or strips: export plain triangles".to_owned());
-            }
-            let reader = primitive.reader(|buffer| match buffer.source() {
-                gltf::buffer::Source::Bin => gltf.blob.as_deref(),
-                gltf::buffer::Source::Uri(_) => None,
-            });
-            let positions = reader.read_positions().ok_or(
-                "keeps its numbers in another file or compressed: export it as one .glb file \
-                 without compression",
-            )?;
-            let first = vertices.len() as u32;
-            vertices.extend(positions.map(|at| {
-                let at = place.transform_point(&nalgebra::Point3::from(at));
-                <[f32; 3]>::from(at.coords)
-            }));
-            let own = vertices.len() as u32 - first;
-            let corners: Vec<u32> = match reader.read_indices() {
-                Some(indices) => indices.into_u32().collect(),
-                None => (0..own).collect(),
-            };
-            if corners.iter().any(|corner| *corner >= own) {
-                return Err("names vertices that it does not have: export it again".to_owned());
-            }
-            let whole = corners.as_chunks::<3>().0.iter();
-            triangles.extend(whole.map(|triangle| triangle.map(|corner| corner + first)));
-        }
     }
     Ok((vertices, triangles))
 }

@@ -72,11 +72,11 @@ pub struct WorldLayout {
     pub start: Region,
     /// Region that the drone's middle must reach.
     pub goal: Region,
-    /// What stands between.
+    /// Obstacles in the bounds.
     pub obstacles: Vec<Obstacle>,
 }
 
-/// What a course has instead of walls across a corridor.
+/// Obstacles, start, goal and ways of a course without walls.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct World {
     pub(super) sides: Sides,
@@ -170,9 +170,11 @@ impl World {
             stage_starts: vec![middle],
         };
         for at in world.ways.from(&middle).collect::<Vec<_>>() {
-            if world.stages_behind(&at) == world.stage_starts.len() && !world.goal.contains(&at) {
-                world.stage_starts.push(at);
-            }
+            let behind = world.stages_behind(&at).min(usize::from(STAGES) - 1);
+            // A short way may pass two stages in one cell.
+            world
+                .stage_starts
+                .resize((behind + 1).max(world.stage_starts.len()), at);
         }
         Ok(world)
     }
@@ -217,10 +219,13 @@ impl World {
             },
         };
         let mut tried = std::iter::repeat_with(|| region.draw(rng)).take(TRIES);
-        tried.find(|at| self.ways.is_roomy(at)).unwrap_or(middle)
+        tried
+            .find(|at| self.ways.is_roomy(at) && self.stages_behind(at) == place)
+            .unwrap_or(middle)
     }
 
-    /// Returns where to fly next from `point`: on the way, at most about `ahead_m` away and in sight.
+    /// Returns where to fly next from `point`: on the way, at most about `ahead_m` away and in
+    /// sight.
     pub(super) fn aim(&self, point: &Point3<f32>, ahead_m: f32) -> Point3<f32> {
         match self.goal.contains(point) {
             true => self.goal.centre_m.into(),

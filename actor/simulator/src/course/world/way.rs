@@ -1,12 +1,12 @@
 //! Ways to the goal through the free space of a world: for every place, how far it is, and where to
 //! fly next.
 //!
-//! The space is divided into cells. A cell is free if the drone's body, level, with a margin, touches
-//! nothing at its middle, and roomy if all cells around it are free. From the goal, lengths spread
-//! over the free cells (Dijkstra's algorithm). In cells that are not roomy they count double, so that
-//! ways keep away from obstacles where they can. So do lengths sideways and, more, lengths back: a
-//! drone flies forward. Motion
-//! is ignored: ways lead past the places where moving obstacles start.
+//! The space is divided into cells. A cell is free if the drone's body, level, with a margin,
+//! touches nothing at its middle, and roomy if all cells around it are free. From the goal, lengths
+//! spread over the free cells (Dijkstra's algorithm). In cells that are not roomy they count
+//! double, so that ways keep away from obstacles where they can. So do lengths sideways and, more,
+//! lengths back: a drone flies forward. Motion is ignored: ways lead past the places where moving
+//! obstacles start.
 
 use std::cmp::Ordering;
 
@@ -150,15 +150,15 @@ impl Grid {
     }
 }
 
-/// Returns the length of a step along `axes` axes into a cell, which leads ahead (`Greater`), aside
-/// or back along x.
-fn step_length(axes: usize, along_x: Ordering, is_roomy: bool) -> u32 {
+/// Returns the length of a step along `axes` axes into a cell of this [`room`], ahead (`Greater`),
+/// aside or back along x.
+fn step_length(axes: usize, along_x: Ordering, room: u32) -> u32 {
     let aside = match along_x {
         Ordering::Greater => 1,
         Ordering::Equal => ASIDE,
         Ordering::Less => BACK,
     };
-    STEPS[axes] * aside * if is_roomy { 1 } else { TIGHT }
+    STEPS[axes] * aside * room
 }
 
 impl Ways {
@@ -182,9 +182,9 @@ impl Ways {
                 if lengths[cell] != length {
                     continue;
                 }
-                let is_roomy = is_roomy(&grid, &is_free, cell);
+                let room = room(&grid, &is_free, cell);
                 for (next, axes, along_x) in grid.around(cell) {
-                    let to_next = length + step_length(axes, along_x.reverse(), is_roomy);
+                    let to_next = length + step_length(axes, along_x.reverse(), room);
                     if is_free[next] && to_next < lengths[next] {
                         lengths[next] = to_next;
                         under_way[to_next as usize % (LONGEST + 1)].push(next);
@@ -227,16 +227,16 @@ impl Ways {
         Some(self.lengths[cell] as f32 / STEP as f32 * self.grid.cell_m)
     }
 
-    /// Returns the way from a point, cell by cell, without the point itself. It is empty at the goal
-    /// and where no way begins.
+    /// Returns the way from a point, cell by cell, without the point itself. It is empty at the
+    /// goal and where no way begins.
     pub(super) fn from(&self, point: &Point3<f32>) -> impl Iterator<Item = Point3<f32>> {
         let next = |&cell: &usize| {
             let around = self.grid.around(cell);
             let best = around
                 .filter(|&(next, ..)| self.lengths[next] < self.lengths[cell])
                 .min_by_key(|&(next, axes, along_x)| {
-                    let is_roomy = is_roomy(&self.grid, &self.is_free, next);
-                    self.lengths[next] + step_length(axes, along_x, is_roomy)
+                    let room = room(&self.grid, &self.is_free, next);
+                    self.lengths[next] + step_length(axes, along_x, room)
                 })?;
             Some(best.0)
         };
@@ -279,6 +279,14 @@ impl Ways {
                 .filter(has_way)
                 .min_by_key(|&cell| self.lengths[cell])
         })
+    }
+}
+
+/// Returns the factor of lengths in a cell: 1 if it is roomy.
+fn room(grid: &Grid, is_free: &[bool], cell: usize) -> u32 {
+    match is_roomy(grid, is_free, cell) {
+        true => 1,
+        false => TIGHT,
     }
 }
 
