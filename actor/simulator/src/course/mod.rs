@@ -13,7 +13,7 @@ mod file;
 mod generator;
 mod mesh;
 mod opening;
-mod polygon;
+pub(crate) mod polygon;
 mod source_location;
 
 use std::fmt;
