@@ -72,6 +72,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
             .map(|_| StepObservation {
                 latent: [(); MAX_LATENT].map(|()| draw()),
                 velocity_mps: [(); 3].map(|()| draw()),
+                goal_m: [(); 3].map(|()| draw()),
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],
                 ground_truth: [0.0; GROUND_TRUTH],

@@ -5,7 +5,7 @@
 //! episode bootstraps from it. An episode flown in segments is committed segment by segment: each
 //! segment is a [`CommittedEpisode`], and so are the segments so far, joined.
 
-use skein_protocol::config::ObservationLayout;
+use skein_protocol::config::{ObservationLayout, SeenStep};
 use skein_protocol::heading::heading;
 use skein_protocol::ids::{ActorId, EpisodeId, Epoch, PolicyVersion};
 use skein_protocol::transition::Outcome;
@@ -18,6 +18,8 @@ pub struct StepObservation {
     pub latent: LatentCode,
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
+    /// The goal from the drone, in the heading frame, in metres: forward, left, up.
+    pub goal_m: [f32; 3],
     /// Position in the world in metres: along the corridor, lateral, up.
     pub position_m: [f32; 3],
     /// Orientation, world from body, as a unit quaternion (i, j, k, w).
@@ -65,7 +67,7 @@ pub struct CommittedEpisode {
     pub teacher_actions: Vec<Action>,
     /// Rewards, `[T]`.
     pub rewards: Vec<f32>,
-    /// Terms of each reward: collision, level-up, destination, open view; `[T]`.
+    /// Terms of each reward: [`REWARD_TERM_NAMES`](skein_protocol::REWARD_TERM_NAMES); `[T]`.
     pub reward_terms: Vec<[f32; REWARD_TERMS]>,
     /// `true` where the step crossed a wall or reached the destination; `[T]`.
     pub level_up: Vec<bool>,
@@ -170,8 +172,8 @@ impl CommittedEpisode {
     /// Writes the critic's input at the beginning of `step`, `[critic_state(action)]`, where the
     /// critic sees the [ground truth](skein_protocol::config::CriticInput::GroundTruth).
     ///
-    /// It holds the ground truth, the velocity, the tilt, the heading of a drone that turns, and the
-    /// action before, which under latency has yet to take effect. Each number is roughly within
+    /// It holds the ground truth, the velocity, the tilt, the heading of a drone that turns, and
+    /// the action before, which under latency has yet to take effect. Each number is roughly within
     /// [-2, 2].
     pub fn write_critic_state(&self, step: usize, action: ActionSpace, into: &mut [f32]) {
         let seen = &self.observations[step];
@@ -206,13 +208,14 @@ impl CommittedEpisode {
     fn write_moment(&self, step: usize, view: &ObservationLayout, into: &mut [f32]) {
         let previous_action = self.action_before(step);
         let seen = &self.observations[step];
-        view.write_step(
-            &seen.latent,
-            &seen.velocity_mps,
-            &seen.orientation,
-            &previous_action,
-            into,
-        );
+        let step = SeenStep {
+            latent: &seen.latent,
+            velocity_mps: &seen.velocity_mps,
+            orientation: &seen.orientation,
+            goal_m: &seen.goal_m,
+            previous_action: &previous_action,
+        };
+        view.write_step(&step, into);
     }
 
     /// Checks that there is a step, and that every part is as long as the number of actions
@@ -273,6 +276,7 @@ pub(crate) mod samples {
                 .map(|step| StepObservation {
                     latent: code(shade(episode, step)),
                     velocity_mps: [1.0, at(step) + 0.25, at(step) + 0.5],
+                    goal_m: [60.0 - step as f32, at(step), 1.0],
                     position_m: [step as f32, 0.0, 3.5],
                     orientation: [0.0, 0.0, 0.0, 1.0],
                     ground_truth: std::array::from_fn(|index| at(step) + index as f32),

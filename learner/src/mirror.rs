@@ -14,8 +14,8 @@ use crate::episode::{CommittedEpisode, StepObservation};
 const TO_THE_LEFT: [usize; 4] = [1, 5, 8, 14];
 
 impl CommittedEpisode {
-    /// Returns the mirrored episode, flown with the numbers of `action`. Its latent codes are still the unmirrored ones: a caller that
-    /// needs codes encodes the mirrored images.
+    /// Returns the mirrored episode, flown with the numbers of `action`. Its latent codes are still
+    /// the unmirrored ones: a caller that needs codes encodes the mirrored images.
     #[must_use]
     pub fn mirrored(&self, action: ActionSpace) -> Self {
         let mut mirrored = self.without_images();
@@ -40,6 +40,7 @@ impl CommittedEpisode {
 fn mirror(seen: &mut StepObservation) {
     seen.position_m[1] *= -1.0;
     seen.velocity_mps[1] *= -1.0;
+    seen.goal_m[1] *= -1.0;
     // Roll and yaw change sign, pitch does not.
     seen.orientation[0] *= -1.0;
     seen.orientation[2] *= -1.0;

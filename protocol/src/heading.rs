@@ -1,4 +1,5 @@
-//! The heading frame: x where the nose points, y to its left, z up. A drone knows its velocity there.
+//! The heading frame: x where the nose points, y to its left, z up. A drone knows its velocity
+//! there.
 
 /// Returns cosine and sine of the angle between the world's x axis and the nose, seen from above.
 /// `orientation`: world from body, as a unit quaternion (i, j, k, w).

@@ -43,7 +43,16 @@ pub type LatentCode = [f32; MAX_LATENT];
 /// Names of the reward's terms, in the order of their sum: those of the simulator's
 /// `reward_terms!`, which `skein-rollout` holds equal to these when it is compiled. Curves are
 /// called `reward/NAME`.
-pub const REWARD_TERM_NAMES: [&str; 4] = ["collision", "level_up", "destination", "open_view"];
+pub const REWARD_TERM_NAMES: [&str; 8] = [
+    "collision",
+    "level_up",
+    "destination",
+    "open_view",
+    "progress",
+    "clearance",
+    "effort",
+    "effort_change",
+];
 /// Number of the reward's terms.
 pub const REWARD_TERMS: usize = REWARD_TERM_NAMES.len();
 /// Length of the simulator's ground truth, [`transition::TransitionRecord::ground_truth`].

@@ -32,8 +32,8 @@ pub enum PolicyError {
     },
     /// The teacher's actions are not those of this run.
     #[error(
-        "teacher.snapshot: the policy in {} was trained with simulator.vehicle.action = \"{}\": set \
-        this here too, or name another file", path.display(), action.name()
+        "teacher.snapshot: the policy in {} was trained with simulator.vehicle.action = \"{}\": \
+        set this here too, or name another file", path.display(), action.name()
     )]
     OtherAction {
         /// The file.

@@ -20,8 +20,8 @@ pub const MAX_MAGNITUDE: f32 = 1e7;
 
 /// Bytes between `hit_wall` and `ground_truth`, so that the image starts on a cache line.
 const RESERVED: usize = {
-    // 353: the header's other fields.
-    let used = size_of::<f32>() * (REWARD_TERMS + GROUND_TRUTH + 2 * MAX_ACTION) + 353;
+    // 365: the header's other fields.
+    let used = size_of::<f32>() * (REWARD_TERMS + GROUND_TRUTH + 2 * MAX_ACTION) + 365;
     used.next_multiple_of(64) - used
 };
 
@@ -59,6 +59,8 @@ pub struct TransitionRecord {
     pub orientation: [f32; 4],
     /// Velocity in the world in metres per second: forward, left, up.
     pub velocity_mps: [f32; 3],
+    /// The goal from the drone, in the heading frame, in metres: forward, left, up.
+    pub goal_m: [f32; 3],
     /// The VAE's latent mean of `depth`; zero from index `vae.latent` on.
     pub latent: LatentCode,
     /// The action, each number in [-1, 1]; zero beyond those of the run's
@@ -296,6 +298,7 @@ impl TransitionRecord {
         finite("position_m", &self.position_m)?;
         finite("orientation", &self.orientation)?;
         finite("velocity_mps", &self.velocity_mps)?;
+        finite("goal_m", &self.goal_m)?;
         finite("latent", &self.latent)?;
         finite("ground_truth", &self.ground_truth)?;
         finite("action", &self.action)?;
@@ -474,6 +477,7 @@ mod tests {
         assert!(check(|r| r.kind = 9).contains("kind"));
         assert!(check(|r| r.kind = RecordKind::Closing.code()).contains("outcome"));
         assert!(check(|r| r.latent[3] = f32::NAN).contains("latent"));
+        assert!(check(|r| r.goal_m[1] = f32::NAN).contains("goal_m"));
         assert!(check(|r| r.ground_truth[15] = f32::NAN).contains("ground_truth"));
         assert!(check(|r| r.reward = f32::INFINITY).contains("reward is not finite"));
         assert!(check(|r| r.velocity_mps[1] = -1e8).contains("velocity_mps holds -100000000"));

@@ -9,7 +9,7 @@ use skein_learner::algorithm::{Algorithm, Inputs};
 use skein_learner::device::use_threads;
 use skein_learner::sac::TorchSac;
 use skein_learner::vae::{TorchVae, images_from_bytes};
-use skein_protocol::config::{Config, Observation, ObservationLayout};
+use skein_protocol::config::{Config, Observation, ObservationLayout, SeenStep};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{
     ENCODER_CHANNELS, ENCODER_FEATURES, ENCODER_KERNEL, Snapshot, SnapshotLayout,
@@ -39,13 +39,14 @@ fn main() {
     let image: [u8; IMAGE_PIXELS] = std::array::from_fn(|pixel| (pixel * 7) as u8);
     let mut observation = vec![0.0; view.len()];
     let mut observe = |latent: LatentCode| {
-        view.write_step(
-            &latent,
-            &[1.0, 0.1, 0.1],
-            &[0.0, 0.0, 0.0, 1.0],
-            &[0.0; MAX_ACTION],
-            &mut observation,
-        );
+        let step = SeenStep {
+            latent: &latent,
+            velocity_mps: &[1.0, 0.1, 0.1],
+            orientation: &[0.0, 0.0, 0.0, 1.0],
+            goal_m: &[30.0, 0.0, 0.0],
+            previous_action: &[0.0; MAX_ACTION],
+        };
+        view.write_step(&step, &mut observation);
         observation.clone()
     };
     let mut group = criterion.benchmark_group("encoder_policy");

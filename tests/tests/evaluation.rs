@@ -138,6 +138,7 @@ fn a_recording_holds_every_step_of_every_episode(run: &EndedRun, latent: usize, 
         ("walls_passed", "|u1", &[]),
         ("terminated", "|u1", &[]),
         ("truncated", "|u1", &[]),
+        ("goal_m", "<f4", &[3]),
     ] {
         let array = array(&file, name, kind);
         assert_eq!(array.shape, [&[rows], row].concat(), "{name}");

@@ -76,6 +76,7 @@ fn fly(side: f32, space: ActionSpace) -> CommittedEpisode {
         observations.push(StepObservation {
             latent: [0.0; MAX_LATENT],
             velocity_mps: state.velocity_mps.into(),
+            goal_m: simulator.goal_m(),
             position_m: state.position_m.coords.into(),
             orientation: state.world_from_body.coords.into(),
             ground_truth: simulator.ground_truth().numbers(),
@@ -86,8 +87,8 @@ fn fly(side: f32, space: ActionSpace) -> CommittedEpisode {
             let (left, up) = (side * (0.7 * phase).sin(), (0.4 * phase).cos());
             let action = match space {
                 ActionSpace::Lateral => [left, up, 0.0, 0.0],
-                ActionSpace::Velocity => [0.8, left, up, 0.0],
-                ActionSpace::VelocityYaw => [0.8, left, up, side * (0.3 * phase).sin()],
+                ActionSpace::Velocity => [0.5, left, up, 0.0],
+                ActionSpace::VelocityYaw => [0.5, left, up, side * 0.1 * (0.3 * phase).sin()],
             };
             simulator.step(action).expect("nothing is hit so soon");
             actions.push(action);
@@ -141,6 +142,7 @@ fn assert_mirrored(space: ActionSpace) {
         for (what, one, other) in [
             ("position", &one.position_m[..], &other.position_m[..]),
             ("velocity", &one.velocity_mps, &other.velocity_mps),
+            ("goal", &one.goal_m, &other.goal_m),
             ("orientation", &one.orientation, &other.orientation),
             ("ground truth", &one.ground_truth, &other.ground_truth),
         ] {

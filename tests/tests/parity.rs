@@ -25,7 +25,7 @@ const SEEDS: std::ops::Range<u64> = 0..3;
 const OBSERVATIONS: [Observation; 3] = [
     Observation::Latent,
     Observation::LatentVelocity,
-    Observation::LatentVelocityAction,
+    Observation::LatentVelocityActionGoal,
 ];
 
 fn config(observation: Observation) -> Config {

@@ -56,6 +56,7 @@ class Policy:
         latents: bytes | None,
         velocities: bytes,
         previous: bytes | None,
+        goals: bytes | None,
         starts: Sequence[bool],
         exploration: str,
     ) -> bytes: ...

@@ -34,6 +34,7 @@ class Actor:
     ``depth``     uint8 [1, 72, 128]    planar depth, top row first; 255 is the range of the
                                         run's camera or farther
     ``velocity``  float32 [3]           forward, left, up, m/s
+    ``goal``      float32 [3]           forward, left, up, m; for a policy that sees it
     ============  ====================  =========================================================
 
     Others are ignored. ``reset`` gets the ticket's seed, and as ``options`` the ticket's
@@ -41,9 +42,9 @@ class Actor:
     a world of its own may ignore them. ``info`` may have:
 
     ================  ====================  =====================================================
-    ``reward_terms``  float32 [4]           in the order of ``REWARD_TERMS``; their sum is the
-                                            reward. Without them, the whole reward counts as the
-                                            last term
+    ``reward_terms``  float32 [8]           in the order of ``REWARD_TERMS``; their sum is the
+                                            reward. Without them, the whole reward counts as
+                                            ``open_view``
     ``walls_passed``  int                   so far. Default 0
     ``walls``         int                   of the course. Default: of the ticket's course
     ``outcome``       int                   index into ``OUTCOMES``. Default: a terminated episode
@@ -191,13 +192,15 @@ def _moment(
     terms = info.get("reward_terms")
     whole = _numbers(where, "reward", reward, 1)[0]
     if terms is None:
-        terms = [0.0] * (_TERMS - 1) + [whole]
+        terms = [0.0] * _TERMS
+        terms[_core.REWARD_TERMS.index("open_view")] = whole
     truth = info.get("ground_truth")
     walls = info.get("walls")
     collided = outcome == OUTCOMES.index("collided")
     return (
         _image(where, observation["depth"]),
         _numbers(where, "velocity", observation["velocity"], 3),
+        None if "goal" not in observation else _numbers(where, "goal", observation["goal"], 3),
         _numbers(where, "info[\"position_m\"]", info.get("position_m", (0, 0, 0)), 3),
         _numbers(where, "info[\"orientation\"]", info.get("orientation", (0, 0, 0, 1)), 4),
         None if truth is None else _numbers(where, "info[\"ground_truth\"]", truth, _TRUTHS),

@@ -26,6 +26,7 @@ _KINDS: dict[str, tuple[Any, int]] = {
     "hit_wall": (np.int64, 0),
     "outcome": (np.int64, 0),
     "velocity": (np.float32, 3),
+    "goal": (np.float32, 3),
     "previous_action": (np.float32, 4),
     "reward_terms": (np.float32, len(_core.REWARD_TERMS)),
     "position_m": (np.float32, 3),

@@ -35,6 +35,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
                                              range (20 m) or farther, 0 is no reading
     ``latent``          float32 [latent]     the encoder's code of that image
     ``velocity``        float32 [3]          forward, left, up, m/s, heading frame
+    ``goal``            float32 [3]          forward, left, up, m, heading frame
     ``previous_action`` float32 [action]     zeros after a reset
     ``ground_truth``    float32 [18]         what the camera does not show
     ==================  ===================  ==================================================

@@ -79,7 +79,7 @@ class Policy:
 
     @property
     def observation(self) -> str:
-        """What it sees of a step: ``latent``, ``latent+velocity`` or ``latent+velocity+action``."""
+        """What it sees of a step, as ``learning.observation``: ``latent+velocity``, …"""
         return self._core.observation
 
     @property
@@ -115,8 +115,9 @@ class Policy:
 
         Args:
             observation: one observation of :class:`skein_rl.CorridorEnv`, or a batch of
-                :class:`skein_rl.CorridorVectorEnv`: ``depth`` (or ``latent``), ``velocity`` and
-                ``previous_action``; without the last, the action returned before.
+                :class:`skein_rl.CorridorVectorEnv`: ``depth`` (or ``latent``), ``velocity``,
+                ``goal`` for a policy that sees it, and ``previous_action``; without the last, the
+                action returned before.
             episode_start: bool ``[n]``, where an episode begins with this observation.
             deterministic: False draws from the policy, as in training.
 
@@ -142,13 +143,16 @@ class Policy:
         depth, latent = observation.get("depth"), observation.get("latent")
         if depth is None and latent is None:
             raise KeyError("the observation has neither \"depth\" nor \"latent\"")
-        previous = observation.get("previous_action")
+        previous, goal = observation.get("previous_action"), observation.get("goal")
+        if goal is None and "goal" in self.observation:
+            raise KeyError("the observation has no \"goal\": observe it, float32 [3]")
         starts = np.zeros(rows, np.bool_) if episode_start is None else np.atleast_1d(episode_start)
         block = self._core.act(
             None if depth is None or latent is not None else _images(depth, rows),
             None if latent is None else _numbers(latent),
             _numbers(velocity),
             None if previous is None else _numbers(previous),
+            None if goal is None else _numbers(goal),
             starts.astype(np.bool_).tolist(),
             "mode" if deterministic else "sample",
         )

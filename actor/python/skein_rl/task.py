@@ -13,7 +13,7 @@ from . import _core
 
 Course = Union[str, "os.PathLike[str]", Mapping[str, Any]]
 
-OBSERVABLE = ("depth", "latent", "velocity", "previous_action", "ground_truth")
+OBSERVABLE = ("depth", "latent", "velocity", "goal", "previous_action", "ground_truth")
 """Parts of an observation."""
 
 OUTCOMES = ("flying", "collided", "reached_end", "timed_out")
@@ -108,6 +108,7 @@ def observation_space(parts: Sequence[str], task: _core.Task) -> spaces.Dict:
         "depth": spaces.Box(0, 255, (1, 72, 128), np.uint8),
         "latent": spaces.Box(-code, code, (max(task.latent, 1),), np.float32),
         "velocity": spaces.Box(-mps, mps, (3,), np.float32),
+        "goal": spaces.Box(-1e4, 1e4, (3,), np.float32),
         "previous_action": action_space(task),
         "ground_truth": spaces.Box(-1e4, 1e4, (_GROUND_TRUTH,), np.float32),
     }

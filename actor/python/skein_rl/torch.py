@@ -16,7 +16,8 @@ from .policy import Policy
 class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
     """Encoder, policy and history, with the inputs and outputs of the ONNX graph.
 
-    ``forward(depth, velocity, history)`` returns ``(action, next_history)``. A history is zeros at
+    ``forward(depth, velocity, history, goal)`` returns ``(action, next_history)``; a goal is needed
+    by a policy that sees it. A history is zeros at
     the start of an episode, see :meth:`start`. Trainable parameters have the snapshot's names.
     """
 
@@ -34,9 +35,8 @@ class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
         self.action = len(policy.action_names)
         # A drone that flies forward at a constant speed sees its velocity left and up alone.
         self.velocity = 3 if "forward" in policy.action_names else 2
-        extra = {"latent": 0, "latent+velocity": self.velocity}
-        extra["latent+velocity+action"] = self.velocity + self.action
-        self.step_len = policy.latent + extra[self.sees]
+        parts = {"velocity": self.velocity, "action": self.action, "goal": 4}
+        self.step_len = policy.latent + sum(parts[part] for part in self.sees.split("+")[1:])
 
     def start(self, n: int = 1) -> torch.Tensor:
         """History of ``n`` episodes that begin."""
@@ -59,14 +59,24 @@ class TorchPolicy(nn.Module):  # type: ignore[misc, unused-ignore]
         return outputs
 
     def forward(
-        self, depth: torch.Tensor, velocity: torch.Tensor, history: torch.Tensor
+        self,
+        depth: torch.Tensor,
+        velocity: torch.Tensor,
+        history: torch.Tensor,
+        goal: torch.Tensor | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions ``[n, action]`` and the next history."""
         newest = history[:, 0]
         starts = newest[:, -1:] < 0.5
-        previous = newest[:, self.step_len : self.step_len + self.action]
-        parts = [self.encode(depth), velocity[:, 3 - self.velocity :], previous]
-        present = torch.cat(parts[: 1 + self.sees.count("+")], dim=1)
+        parts = {
+            "latent": self.encode(depth),
+            "velocity": velocity[:, 3 - self.velocity :],
+            "action": newest[:, self.step_len : self.step_len + self.action],
+        }
+        if goal is not None:
+            away = goal.norm(dim=1, keepdim=True)
+            parts["goal"] = torch.cat([goal / away.clamp(min=1e-3), away * 0.05], dim=1)
+        present = torch.cat([parts[part] for part in self.sees.split("+")], dim=1)
         past = torch.where(starts[:, None], present[:, None], history[:, :, : self.step_len])
         moments = [present] + [past[:, back - 1] for back in self.history_steps]
         action = torch.tanh(self.distribution(torch.cat(moments, dim=1))[:, : self.action])

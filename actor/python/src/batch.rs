@@ -19,7 +19,7 @@ enum Column {
 }
 
 /// Columns behind images and latent codes: name, as `skein_rl/batch.py` calls it, and content.
-const COLUMNS: [(&str, Column); 18] = [
+const COLUMNS: [(&str, Column); 19] = [
     ("reward", Column::F64(|m| f64::from(m.reward))),
     ("seed", Column::I64(|m| m.seed.cast_signed())),
     ("course_seed", Column::I64(|m| m.course_seed.cast_signed())),
@@ -30,6 +30,7 @@ const COLUMNS: [(&str, Column); 18] = [
     ("hit_wall", Column::I64(|m| m.hit_wall.into())),
     ("outcome", Column::I64(|m| m.outcome.into())),
     ("velocity", Column::F32(&|m| &m.velocity_mps)),
+    ("goal", Column::F32(&|m| &m.goal_m)),
     ("previous_action", Column::F32(&|m| &m.previous_action)),
     ("reward_terms", Column::F32(&|m| &m.reward_terms)),
     ("position_m", Column::F32(&|m| &m.position_m)),

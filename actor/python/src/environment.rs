@@ -75,6 +75,8 @@ pub(crate) struct Moment {
     pub(crate) latent: LatentCode,
     /// Forward, left, up, m/s; in the heading frame.
     pub(crate) velocity_mps: [f32; 3],
+    /// Forward, left, up in the heading frame, m.
+    pub(crate) goal_m: [f32; 3],
     /// Zero after a reset.
     pub(crate) previous_action: Action,
     pub(crate) reward: f32,
@@ -272,6 +274,7 @@ impl Moment {
     pub(crate) const EMPTY: Self = Self {
         latent: [0.0; MAX_LATENT],
         velocity_mps: [0.0; 3],
+        goal_m: [0.0; 3],
         previous_action: [0.0; MAX_ACTION],
         reward: 0.0,
         reward_terms: [0.0; REWARD_TERMS],
@@ -305,6 +308,7 @@ impl Moment {
         };
         Self {
             velocity_mps: velocity.map(|mps| mps.clamp(-MOST_MPS, MOST_MPS)),
+            goal_m: simulator.goal_m(),
             previous_action: flight.flown.last().copied().unwrap_or_default(),
             walls_passed: simulator.walls_passed(),
             level: simulator.level(),

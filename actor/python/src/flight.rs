@@ -193,6 +193,7 @@ fn columns<'py>(
     dict.set_item("orientation", numbers(&|record| &record.orientation))?;
     dict.set_item("velocity_mps", numbers(&|record| &record.velocity_mps))?;
     let action = lengths.action.numbers();
+    dict.set_item("goal_m", numbers(&|record| &record.goal_m))?;
     dict.set_item("action", numbers(&|record| &record.action[..action]))?;
     dict.set_item("reward_terms", numbers(&|record| &record.reward_terms))?;
     dict.set_item(

@@ -9,7 +9,7 @@ use pyo3::types::{PyBytes, PyDict};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::{Config, Observation};
+use skein_protocol::config::Config;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::ticket::Exploration;
@@ -79,9 +79,10 @@ impl Policy {
         self.rows.len()
     }
 
-    /// Actions, f32 `[n, action]`. Bytes of `images`: u8 `[n, 9216]`, or of `latents`: f32
-    /// `[n, latent]`; of `velocities`: f32 `[n, 3]`; of `previous`: f32 `[n, action]`, by default the
-    /// actions returned before; `starts`: rows whose episode begins.
+    /// Actions, f32 `[n, action]`. Bytes of `images`: u8 `[n, 9216]`, or of `latents`: f32 `[n,
+    /// latent]`; of `velocities`: f32 `[n, 3]`; of `previous`: f32 `[n, action]`, by default the
+    /// actions returned before; of `goals`: f32 `[n, 3]`, by default zeros; `starts`: rows whose
+    /// episode begins.
     #[allow(clippy::too_many_arguments, reason = "the columns of a batch")]
     fn act<'py>(
         &mut self,
@@ -90,6 +91,7 @@ impl Policy {
         latents: Option<&[u8]>,
         velocities: &[u8],
         previous: Option<&[u8]>,
+        goals: Option<&[u8]>,
         starts: Vec<bool>,
         exploration: &str,
     ) -> PyResult<Bound<'py, PyBytes>> {
@@ -105,6 +107,10 @@ impl Policy {
             previous: previous
                 .map(|bytes| actions_of("previous_action", bytes, count, action))
                 .transpose()?,
+            goals: match goals {
+                Some(goals) => rows_of("goal", goals, count)?,
+                None => vec![[0.0; 3]; count],
+            },
         };
         seen.check()?;
         if starts.len() != count {
@@ -191,11 +197,7 @@ impl Policy {
     /// Policy input per step, as the configuration names it.
     #[getter]
     fn observation(&self) -> &'static str {
-        match self.config.learning.observation {
-            Observation::Latent => "latent",
-            Observation::LatentVelocity => "latent+velocity",
-            Observation::LatentVelocityAction => "latent+velocity+action",
-        }
+        self.config.learning.observation.name()
     }
 
     /// Names of the numbers of an action, in order.
@@ -225,6 +227,7 @@ struct Seen<'a> {
     latent: usize,
     velocities: Vec<[f32; 3]>,
     previous: Option<Vec<Action>>,
+    goals: Vec<[f32; 3]>,
 }
 
 impl Seen<'_> {
@@ -236,6 +239,7 @@ impl Seen<'_> {
             ("latent", latents.as_flattened()),
             ("velocity", self.velocities.as_flattened()),
             ("previous_action", previous.as_flattened()),
+            ("goal", self.goals.as_flattened()),
         ] {
             if let Some(number) = numbers.iter().find(|number| !number.is_finite()) {
                 return Err(refused(format!("{name} holds {number}: it must be finite")));
@@ -264,6 +268,7 @@ impl Row {
         let record = &mut self.record;
         record.step = self.next_step;
         record.velocity_mps = seen.velocities[index];
+        record.goal_m = seen.goals[index];
         record.latent = match seen.images {
             Some(images) => network.encode(&images[index], &mut self.scratch),
             None => seen.code(index),

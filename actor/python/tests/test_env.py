@@ -24,7 +24,16 @@ def bits(results):
     return [{name: part.tobytes() for name, part in one.items()} for one in observations]
 
 
-@pytest.mark.parametrize("keywords", [{}, {"courses": "random"}, {"observation": ["ground_truth"]}])
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {},
+        {"courses": "random"},
+        {"observation": ["ground_truth"]},
+        {"vehicle": {"action": "velocity"}},
+        {"vehicle": {"action": "velocity+yaw"}, "observation": ["goal", "previous_action"]},
+    ],
+)
 def test_gymnasiums_checker_has_no_complaint(keywords):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -33,6 +42,28 @@ def test_gymnasiums_checker_has_no_complaint(keywords):
                 "Skein/Corridor-v0", render_mode=mode, disable_env_checker=True, **keywords
             )
             check_env(env.unwrapped)
+
+
+def test_an_action_has_the_numbers_of_the_setting():
+    names = {"lateral": [], "velocity": ["forward"], "velocity+yaw": ["forward"]}
+    for action, first in names.items():
+        env = skein_rl.CorridorEnv(
+            vehicle={"action": action, "max_speed_mps": 2.0},
+            observation=["velocity", "goal", "previous_action"],
+        )
+        last = ["yaw_rate"] if action == "velocity+yaw" else []
+        assert env.action_names == [*first, "left", "up", *last]
+        shape = (len(env.action_names),)
+        before, _ = env.reset(seed=1)
+        assert env.action_space.shape == before["previous_action"].shape == shape
+        assert env.oracle_action().shape == shape
+        for _ in range(3):
+            after, *_ = env.step(np.full(shape, 0.5, np.float32))
+        assert after["previous_action"].tolist() == [0.5] * len(env.action_names)
+        if first:
+            assert np.linalg.norm(after["goal"]) < np.linalg.norm(before["goal"])
+        with pytest.raises(ValueError, match="action has the shape"):
+            env.step(np.zeros(len(env.action_names) + 1, np.float32))
 
 
 def test_an_episode_is_a_function_of_its_seed():

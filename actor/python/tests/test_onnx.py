@@ -12,13 +12,25 @@ import skein_rl
 onnx = pytest.importorskip("onnx")
 runtime = pytest.importorskip("onnxruntime")
 
-OBSERVATIONS = {"latent": 0, "latent+velocity": 2, "latent+velocity+action": 4}
+ACTIONS = {"lateral": 2, "velocity": 3, "velocity+yaw": 4}
 CASES = [
-    (algorithm, observation, history, latent)
+    (algorithm, observation, history, latent, "lateral")
     for algorithm in ("sac", "td3", "distill")
-    for observation in OBSERVATIONS
+    for observation in ("latent", "latent+velocity", "latent+velocity+action")
     for history, latent in (([], 32), ([1], 8), ([2, 4], 64))
+] + [
+    ("sac", "latent+velocity+action+goal", [2, 4], 8, "velocity+yaw"),
+    ("sac", "latent+velocity+action", [1], 8, "velocity"),
+    ("td3", "latent+velocity+goal", [], 8, "velocity"),
+    ("distill", "latent+goal", [1], 8, "lateral"),
 ]
+
+
+def length_of(observation, action):
+    """Numbers of a step behind the latent code."""
+    velocity = 2 if action == "lateral" else 3
+    lengths = {"velocity": velocity, "action": ACTIONS[action], "goal": 4}
+    return sum(lengths[part] for part in observation.split("+")[1:])
 
 
 def session_of(path):
@@ -33,15 +45,23 @@ def history_of(session, rows):
     return np.zeros((rows, *shape[1:]), np.float32)
 
 
-def largest_difference(policy, session, steps):
+def largest_difference(policy, session, steps, action="lateral"):
     """Flies two episodes at once by the policy; compares each action with the graph's."""
-    vector = skein_rl.make_vec(2, 1, courses="random", autoreset_mode="DISABLED")
+    vector = skein_rl.make_vec(
+        2,
+        1,
+        courses="random",
+        vehicle={"action": action},
+        observation=["depth", "velocity", "goal", "previous_action"],
+        autoreset_mode="DISABLED",
+    )
+    given = [one.name for one in session.get_inputs() if one.name != "history"]
     observations, _ = vector.reset(seed=3)
     history, largest = history_of(session, 2), 0.0
     policy.reset(2)
     for _ in range(steps):
         actions = policy.act(observations)
-        inputs = {name: observations[name] for name in ("depth", "velocity")}
+        inputs = {name: observations[name] for name in given}
         found, history = session.run(None, {**inputs, "history": history})
         largest = max(largest, float(np.abs(found - actions).max()))
         observations, _, terminated, truncated, _ = vector.step(actions)
@@ -52,12 +72,13 @@ def largest_difference(policy, session, steps):
     return largest
 
 
-@pytest.mark.parametrize(("algorithm", "observation", "history", "latent"), CASES)
-def test_every_kind_of_policy_agrees(tmp_path, algorithm, observation, history, latent):
+@pytest.mark.parametrize(("algorithm", "observation", "history", "latent", "action"), CASES)
+def test_every_kind_of_policy_agrees(tmp_path, algorithm, observation, history, latent, action):
     sections = [
         f'[learning]\nalgorithm = "{algorithm}"\nobservation = "{observation}"\n'
         f"history_steps = {history}",
         f"[vae]\nlatent = {latent}\n[{algorithm}]\nhidden_width = 16",
+        f'[simulator.vehicle]\naction = "{action}"',
     ]
     if algorithm == "distill":
         sections.append('[teacher]\npolicy = "oracle"')
@@ -65,13 +86,13 @@ def test_every_kind_of_policy_agrees(tmp_path, algorithm, observation, history, 
         tmp_path / "policy.safetensors",
         "\n".join(sections),
         latent,
-        latent + OBSERVATIONS[observation],
+        latent + length_of(observation, action),
         history,
-        2 if algorithm == "td3" else 4,
+        ACTIONS[action] * (1 if algorithm == "td3" else 2),
     )
     policy = skein_rl.Policy.load(snapshot, threads=1)
     policy.to_onnx(tmp_path / "graph.onnx")
-    assert largest_difference(policy, session_of(tmp_path / "graph.onnx"), 20) < 1e-5
+    assert largest_difference(policy, session_of(tmp_path / "graph.onnx"), 20, action) < 1e-5
 
 
 def test_the_shipped_policy_agrees_on_whole_episodes(policy, tmp_path):

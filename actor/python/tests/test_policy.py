@@ -84,6 +84,7 @@ def test_it_says_what_it_is(policy):
     config = policy.config
     assert policy.latent == config["vae"]["latent"]
     assert policy.observation == config["learning"]["observation"]
+    assert policy.action_names == ["left", "up"]
     assert policy.history_steps == config["learning"]["history_steps"]
     assert len(policy.sha256) == 64
     assert policy.parameters()["encoder.conv1.weight"].shape == (32, 1, 4, 4)

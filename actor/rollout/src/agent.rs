@@ -2,7 +2,7 @@
 
 use rand::{Rng, RngExt};
 use skein_inference::{ActionDistribution, Network, Scratch};
-use skein_protocol::config::ObservationLayout;
+use skein_protocol::config::{ObservationLayout, SeenStep};
 use skein_protocol::stages::Stage;
 use skein_protocol::ticket::Exploration;
 use skein_protocol::transition::TransitionRecord;
@@ -111,12 +111,14 @@ impl Agent {
         let len = self.layout.step_len();
         let first = record.step as usize * len;
         self.step_inputs.resize(first + len, 0.0);
-        self.layout.write_step(
+        let seen = SeenStep {
             latent,
-            &record.velocity_mps,
-            &record.orientation,
+            velocity_mps: &record.velocity_mps,
+            orientation: &record.orientation,
+            goal_m: &record.goal_m,
             previous_action,
-            &mut self.step_inputs[first..],
-        );
+        };
+        self.layout
+            .write_step(&seen, &mut self.step_inputs[first..]);
     }
 }

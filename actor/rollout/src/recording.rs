@@ -79,7 +79,7 @@ pub struct RecordingRow<'a> {
 }
 
 /// All arrays with one row per observation. [`NAME_LISTS`] are written in addition.
-pub const COLUMNS: [Column; 16] = [
+pub const COLUMNS: [Column; 17] = [
     Column::new(
         "course",
         "<i4",
@@ -211,6 +211,15 @@ pub const COLUMNS: [Column; 16] = [
         "1 where the step limit ended the episode",
         |row, out| {
             out.push(row.record.truncated);
+        },
+    ),
+    Column::new(
+        "goal_m",
+        "<f4",
+        &[Fixed(3)],
+        "the goal from the drone, forward, left, up; metres, heading frame",
+        |row, out| {
+            put(out, &row.record.goal_m);
         },
     ),
 ];
@@ -540,14 +549,17 @@ mod tests {
         assert_eq!(values::<u32>(&names)[9], 0xe4);
         let (header, names) = array(&file, "reward_term_names");
         assert!(
-            header.contains("'<U11'") && header.contains(&format!("({REWARD_TERMS},)")),
+            header.contains("'<U13'") && header.contains(&format!("({REWARD_TERMS},)")),
             "{header}"
         );
         let letters: String = values::<u32>(&names)
             .into_iter()
             .filter_map(char::from_u32)
             .collect();
-        assert!(letters.starts_with("collision\0\0level_up"), "{letters:?}");
+        assert!(
+            letters.starts_with("collision\0\0\0\0level_up"),
+            "{letters:?}"
+        );
     }
 
     #[test]

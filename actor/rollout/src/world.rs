@@ -38,7 +38,7 @@ pub trait World {
     /// Draws the current depth image into `image`.
     fn render(&mut self, image: &mut [u8; IMAGE_PIXELS]);
 
-    /// Writes pose, velocity and ground truth of the current moment into `record`.
+    /// Writes pose, velocity, goal and ground truth of the current moment into `record`.
     fn measure(&mut self, record: &mut TransitionRecord);
 
     /// Flies one step.
@@ -92,6 +92,7 @@ impl World for Simulator {
         record.position_m = state.position_m.coords.into();
         record.orientation = state.world_from_body.coords.into();
         record.velocity_mps = state.velocity_mps.into();
+        record.goal_m = self.goal_m();
         record.ground_truth = self.ground_truth().numbers();
     }
 

@@ -10,7 +10,7 @@
 //! | module | content |
 //! |---|---|
 //! | [`simulator`] | [`Simulator`](simulator::Simulator): `reset`, `step`, `render` |
-//! | [`reward`] | the four terms of the reward and their sizes |
+//! | [`reward`] | the terms of the reward and their sizes |
 //! | [`course`] | corridors with walls and openings, worlds of obstacles; files; random ones |
 //! | [`vehicle`] | drone presets and their flight controller |
 //! | [`camera`] | depth image, with or without a stereo camera's errors |

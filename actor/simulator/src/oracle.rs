@@ -21,8 +21,8 @@ struct Steering {
 }
 
 /// To the side and forward the drone lags 0.9 s. Damping brakes it early, so that it may approach
-/// quickly. Of 500 episodes with all disturbances of `configs/evaluations/generalist.toml`, gains of
-/// 0.8 and 0.5 on both axes lost two. These lost none of 1000.
+/// quickly. Of 500 episodes with all disturbances of `configs/evaluations/generalist.toml`, gains
+/// of 0.8 and 0.5 on both axes lost two. These lost none of 1000.
 const LEVEL: Steering = Steering {
     approach_per_sec: 1.0,
     damping: 1.0,
@@ -56,15 +56,16 @@ impl Steering {
 const HOLD_M: f32 = 0.3;
 
 /// Distance of the nose from a wall where the oracle waits until it is in line with the opening, m.
-/// From there the camera sees 1.5 m to either side.
+/// From there the camera sees 1.3 m to either side.
 const WAIT_M: f32 = 1.0;
 
-/// Farther from the wall behind than it must be, m, so that the oracle does not wait on the edge of
-/// [`HOLD_M`].
-const WAIT_MARGIN_M: f32 = 0.15;
+/// Distance by which the oracle waits farther from the wall behind than [`HOLD_M`], m. It passes
+/// that distance at some speed: a policy that imitates it then knows that it has. With 0.15 m,
+/// policies turned aside too early and hit the wall behind with their tail.
+const WAIT_MARGIN_M: f32 = 0.45;
 
-/// Half the diagonal of the drone's cross-section, 0.98 x 0.29 m: what an opening must have room for
-/// at any roll, m.
+/// Half the diagonal of the drone's cross-section, 0.98 x 0.29 m: what an opening must have room
+/// for at any roll, m.
 const BODY_RADIUS_M: f32 = 0.511;
 
 /// Least distance of the nose from a wall where the oracle waits, m.
@@ -76,8 +77,8 @@ const FORESIGHT_SECS: f32 = 0.5;
 /// Least distance from the start to a wall for a drone that waits there, m.
 pub(crate) const HOVER_BEHIND_START_M: f32 = DRONE_WIDTH_M / 2.0 + LEAST_WAIT_M;
 
-/// Least distance between the back of a wall and the next one's front for a drone that waits between
-/// them, m.
+/// Least distance between the back of a wall and the next one's front for a drone that waits
+/// between them, m.
 pub(crate) const HOVER_BEHIND_WALL_M: f32 = DRONE_WIDTH_M + HOLD_M + WAIT_MARGIN_M + LEAST_WAIT_M;
 
 /// Distance that the oracle looks ahead along the way through a world, m.
@@ -166,8 +167,8 @@ impl Oracle<'_> {
         }
     }
 
-    /// Returns where along the corridor the drone is to stop: before the first wall whose opening it
-    /// is not in line with, else far behind the end. The more it is in line, the farther.
+    /// Returns where along the corridor the drone is to stop: before the first wall whose opening
+    /// it is not in line with, else far behind the end. The more it is in line, the farther.
     fn stop_x_m(&self, walls_behind: usize, state: &VehicleState) -> f32 {
         let walls = self.course.walls();
         let beyond_m = 3.0 * self.vehicle.max_speed_mps;

@@ -1,4 +1,5 @@
-//! The paper's reward: four terms, added up in every step.
+//! The reward: a sum of terms in every step, each with a setting of its own; 0 turns a term off.
+//! The first four are the paper's.
 //!
 //! `reward_terms!` lists them: settings, records, curves and recordings follow from the list.
 //!
@@ -8,6 +9,10 @@
 //! | `level_up` | the drone passes a wall in the step | the setting, a bonus | 1 |
 //! | `destination` | the step reaches the end wall | the setting, a bonus | 1 |
 //! | `open_view` | in every step | the setting `k` times a view contrast in [-1, 1] | `k` = 1 |
+//! | `progress` | in every step | `k` per metre nearer to the goal | `k` = 0 |
+//! | `clearance` | within 1 m of a surface after the step | `-k` per missing metre | `k` = 0 |
+//! | `effort` | in every step | `-k` times the mean square of the action's numbers | `k` = 0 |
+//! | `effort_change` | in every step | `-k` times the mean square of their change | `k` = 0 |
 //!
 //! `open_view` rewards looking into open space: its contrast is the mean depth of the image's
 //! central 16 × 16 pixels minus the mean depth of the whole image. The paper calls it the "action
@@ -66,6 +71,10 @@ macro_rules! reward_terms {
             pub fn values(&self) -> [f32; Self::NAMES.len()] {
                 [$(self.$name),+]
             }
+
+            fn values_mut(&mut self) -> [&mut f32; Self::NAMES.len()] {
+                [$(&mut self.$name),+]
+            }
         }
     };
 }
@@ -81,6 +90,18 @@ reward_terms! {
     /// [0, 1], given in every step: between −k and k. The setting is the factor `k`. Default 1; 0
     /// rewards events only.
     open_view = 1.0,
+    /// `k ·` metres nearer to the middle of the end wall, given in every step. The setting is the
+    /// factor `k`. Default 0.
+    progress = 0.0,
+    /// `-k · max(0, 1 − d)`, with the distance `d` in metres from the body's middle to the nearest
+    /// surface after the step: between −k and 0. The setting is the factor `k`. Default 0.
+    clearance = 0.0,
+    /// `-k ·` mean square of the action's numbers, given in every step: between −k and 0. The
+    /// setting is the factor `k`. Default 0.
+    effort = 0.0,
+    /// `-k ·` mean square of the change of the action's numbers since the step before, given in
+    /// every step: between −4k and 0. The setting is the factor `k`. Default 0.
+    effort_change = 0.0,
 }
 
 impl RewardSettings {
@@ -121,6 +142,10 @@ impl RewardTerms {
     ) -> Self {
         let mut terms = Self {
             open_view: settings.open_view * centre_minus_whole(image_after),
+            progress: settings.progress * report.progress_m,
+            clearance: -settings.clearance * (1.0 - report.clearance_m).max(0.0),
+            effort: -settings.effort * report.effort,
+            effort_change: -settings.effort_change * report.effort_change,
             ..Self::default()
         };
         if report.outcome == Some(EpisodeOutcome::Collided) {
@@ -131,6 +156,16 @@ impl RewardTerms {
         }
         if report.outcome == Some(EpisodeOutcome::ReachedEnd) {
             terms.destination = settings.destination;
+        }
+        terms
+    }
+
+    /// Returns the terms with these values, in the order of [`RewardTerms::NAMES`].
+    #[must_use]
+    pub fn from_values(values: [f32; Self::NAMES.len()]) -> Self {
+        let mut terms = Self::default();
+        for (term, value) in terms.values_mut().into_iter().zip(values) {
+            *term = value;
         }
         terms
     }
@@ -166,7 +201,8 @@ mod tests {
             walls_passed: 1,
             level_up,
             outcome,
-            hit: None,
+            clearance_m: 2.0,
+            ..StepReport::default()
         }
     }
 
@@ -244,6 +280,31 @@ mod tests {
             (-3.0, 2.0, 0.0)
         );
         assert_eq!(terms.total(), -1.0);
+    }
+
+    #[test]
+    fn a_step_is_paid_for_progress_and_charged_for_nearness_and_effort() {
+        let report = StepReport {
+            progress_m: 0.5,
+            clearance_m: 0.75,
+            effort: 0.2,
+            effort_change: 0.1,
+            ..report(LevelUp::No, None)
+        };
+        let of = |settings: &RewardSettings| {
+            RewardTerms::of(settings, &report, &[0; IMAGE_PIXELS]).values()
+        };
+        assert_eq!(of(&RewardSettings::default()), [0.0; 8]);
+        let settings = RewardSettings {
+            progress: 2.0,
+            clearance: 4.0,
+            effort: 5.0,
+            effort_change: 10.0,
+            ..Default::default()
+        };
+        assert_eq!(of(&settings)[4..], [1.0, -1.0, -1.0, -1.0]);
+        let terms = RewardTerms::from_values(of(&settings));
+        assert_eq!(terms.values(), of(&settings));
     }
 
     #[test]

@@ -15,9 +15,10 @@ pub enum EpisodeOutcome {
 }
 
 /// `Yes` if the drone passed a wall in a step.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum LevelUp {
     /// It passed none.
+    #[default]
     No,
     /// Its tail left a wall behind: the whole body is clear of it.
     Yes,
@@ -34,7 +35,7 @@ pub enum Obstacle {
 }
 
 /// Result of one step.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepReport {
     /// Walls passed in this episode so far.
     pub walls_passed: u8,
@@ -44,4 +45,12 @@ pub struct StepReport {
     pub outcome: Option<EpisodeOutcome>,
     /// Obstacle that the body hit, if `outcome` is [`EpisodeOutcome::Collided`].
     pub hit: Option<Obstacle>,
+    /// Metres by which the drone came nearer to the goal, the middle of the end wall.
+    pub progress_m: f32,
+    /// Distance from the body's middle to the nearest surface, m.
+    pub clearance_m: f32,
+    /// Mean square of the action's numbers.
+    pub effort: f32,
+    /// Mean square of their change since the step before. Before the first step they were zero.
+    pub effort_change: f32,
 }

@@ -67,6 +67,12 @@ impl Surfaces {
             .intersecting
     }
 
+    /// Returns the distance of a point, m.
+    pub(crate) fn distance_m(&self, point_m: &Point3<f32>) -> f32 {
+        let point_m = glam(&point_m.coords);
+        self.triangles.distance_to_local_point(point_m, false).abs()
+    }
+
     /// Returns `true` if an upright box touches them. `half_m`: half its size, metres.
     pub(crate) fn touch_box(&self, middle_m: &Point3<f32>, half_m: &Vector3<f32>) -> bool {
         let pose = Pose::from_translation(glam(&middle_m.coords));

@@ -163,6 +163,21 @@ impl World {
         self.touches_obstacle_at(self.body.pose())
     }
 
+    /// Returns the distance of the body's middle to the nearest obstacle of a world, m; infinite
+    /// without obstacles.
+    pub(crate) fn to_obstacle_m(&self) -> f32 {
+        let middle = point(self.body.pose());
+        let still = self.still.as_ref().map(|still| still.distance_m(&middle));
+        let moving = self.moving.iter().map(|obstacle| {
+            let offset_m = obstacle.motion.offset_m(obstacle.number, self.moment);
+            obstacle.surfaces.distance_m(&(middle - offset_m))
+        });
+        still
+            .into_iter()
+            .chain(moving)
+            .fold(f32::INFINITY, f32::min)
+    }
+
     /// Returns what a body of these `bounds` touches at `world_from_body`.
     fn contact_at(&self, world_from_body: &Pose, bounds: &Aabb) -> Contact {
         let inside = &self.interior;

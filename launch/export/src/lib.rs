@@ -6,6 +6,7 @@
 //! | `depth` | u8 `[batch, 1, 72, 128]` | depth image; 255 is the range or farther |
 //! | `velocity` | f32 `[batch, 3]` | forward, left, up in the heading frame, m/s |
 //! | `history` | f32 `[batch, rows, width]` | zeros at a reset, else the last `next_history` |
+//! | `goal` | f32 `[batch, 3]` | goal in the heading frame, m, if the policy sees it |
 //! | `action` | f32 `[batch, action]` | numbers of `simulator.vehicle.action`, in [-1, 1] |
 //! | `next_history` | as `history` | for the next call |
 //!
@@ -21,7 +22,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use prost::Message;
-use skein_protocol::config::{Config, Observation};
+use skein_protocol::config::{Config, GOAL_SCALE, LEAST_GOAL_M, Observation};
 use skein_protocol::files::destination;
 use skein_protocol::snapshot::{
     POLICY_LAYERS, PolicyHead, Snapshot, SnapshotError, SnapshotLayout,
@@ -124,6 +125,7 @@ struct History {
     step_len: usize,
     /// Numbers of an action.
     action: ActionSpace,
+    per_step: Observation,
 }
 
 impl History {
@@ -134,6 +136,7 @@ impl History {
             rows: layout.history_steps.last().copied().unwrap_or(1),
             step_len: layout.step_len(),
             action: layout.action,
+            per_step: layout.per_step,
         }
     }
 
@@ -175,6 +178,14 @@ fn inputs(graph: &mut Graph, history: &History) {
         &history.shape(),
         "zeros at the start of an episode, then next_history of the last call",
     );
+    if history.per_step.has_goal() {
+        graph.input(
+            "goal",
+            Number::F32,
+            &[Length::Batch, Length::Fixed(3)],
+            "the goal from the drone: forward, left, up in the heading frame, m",
+        );
+    }
 }
 
 fn outputs(graph: &mut Graph, history: &History) {
@@ -231,14 +242,18 @@ fn remember(graph: &mut Graph, config: &Config, history: &History) {
     graph.node("Unsqueeze", &["is_reset", "second"], "rows_reset", &[]);
 
     let mut parts = vec!["latent"];
-    if config.learning.observation != Observation::Latent {
+    if history.per_step.has_velocity() {
         let seen = config.observation_layout().velocity_len();
         graph.slice("velocity", "own_velocity", 1, 3 - seen..3);
         parts.push("own_velocity");
     }
-    if config.learning.observation == Observation::LatentVelocityAction {
+    if history.per_step.has_action() {
         graph.slice("newest", "previous_action", 1, step_len..step_len + action);
         parts.push("previous_action");
+    }
+    if history.per_step.has_goal() {
+        see_goal(graph);
+        parts.extend(["goal_direction", "goal_distance"]);
     }
     graph.node("Concat", &parts, "present", &[Attribute::Int("axis", 1)]);
 
@@ -264,6 +279,17 @@ fn remember(graph: &mut Graph, config: &Config, history: &History) {
         "observation",
         &[Attribute::Int("axis", 1)],
     );
+}
+
+/// `goal` to its direction and its scaled distance.
+fn see_goal(graph: &mut Graph) {
+    let along = || Attribute::Ints("axes", vec![1]);
+    graph.node("ReduceL2", &["goal"], "goal_m", &[along()]);
+    graph.constant("least_goal_m", &[], &[LEAST_GOAL_M]);
+    graph.node("Max", &["goal_m", "least_goal_m"], "goal_length", &[]);
+    graph.node("Div", &["goal", "goal_length"], "goal_direction", &[]);
+    graph.constant("goal_scale", &[], &[GOAL_SCALE]);
+    graph.node("Mul", &["goal_m", "goal_scale"], "goal_distance", &[]);
 }
 
 /// `observation` to `action`, without exploration.
@@ -379,11 +405,7 @@ fn action_limits(config: &Config) -> String {
 }
 
 fn layout_text(config: &Config) -> String {
-    let per_step = match config.learning.observation {
-        Observation::Latent => "latent",
-        Observation::LatentVelocity => "latent+velocity",
-        Observation::LatentVelocityAction => "latent+velocity+action",
-    };
+    let per_step = config.learning.observation.name();
     format!(
         "{per_step}, of now and {:?} steps ago",
         config.learning.history_steps
@@ -409,11 +431,7 @@ mod tests {
 
     #[test]
     fn every_name_that_a_node_reads_was_written_before_it() {
-        for observation in [
-            Observation::Latent,
-            Observation::LatentVelocity,
-            Observation::LatentVelocityAction,
-        ] {
+        for observation in Observation::ALL {
             for history in [vec![], vec![1], vec![2, 4]] {
                 let model = model(|config| {
                     config.learning.observation = observation;

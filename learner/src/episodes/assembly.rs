@@ -162,6 +162,7 @@ impl Assembly {
         self.episode.observations.push(StepObservation {
             latent: record.latent,
             velocity_mps: record.velocity_mps,
+            goal_m: record.goal_m,
             position_m: record.position_m,
             orientation: record.orientation,
             ground_truth: record.ground_truth,

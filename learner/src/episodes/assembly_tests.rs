@@ -245,6 +245,7 @@ fn a_segment_begins_where_the_one_before_it_ended_with_the_walls_that_were_passe
     let seen = StepObservation {
         latent: [9.0; skein_protocol::MAX_LATENT],
         velocity_mps: [1.0, 0.5, 0.0],
+        goal_m: [20.0, 0.0, 0.0],
         position_m: [3.0, 0.0, 2.0],
         orientation: [0.0, 0.0, 0.0, 1.0],
         ground_truth: [0.0; skein_protocol::GROUND_TRUTH],

@@ -69,8 +69,8 @@ pub struct Minibatch {
     pub rewards: Vec<f32>,
     /// Observations after the action, `[batch, observation]`.
     pub next_observations: Vec<f32>,
-    /// Critic inputs before the action, `[batch, critic_state(action)]`; empty if the critic sees the
-    /// observation.
+    /// Critic inputs before the action, `[batch, critic_state(action)]`; empty if the critic sees
+    /// the observation.
     pub critic_states: Vec<f32>,
     /// Critic inputs after the action, likewise.
     pub next_critic_states: Vec<f32>,

@@ -58,7 +58,8 @@ pub struct NativeSac {
 #[derive(Debug, Default)]
 struct UpdateBuffers {
     rows: usize,
-    /// Policy network outputs, `[2 rows, 2 · action]`: first for the next observations s', then for s.
+    /// Policy network outputs, `[2 rows, 2 · action]`: first for the next observations s', then for
+    /// s.
     outputs: Vec<f32>,
     /// Actions drawn from those outputs, and their log-probabilities: rows of s' first, then of s.
     sample: Sample,
@@ -141,7 +142,10 @@ impl NativeSac {
         self.policy
             .forward(team, policy, columns.observations, activations);
         state_outputs.copy_from_slice(output(activations));
-        noise.fill_normal(&mut sample.noise);
+        // Two draws, as the reference's: noise comes in pairs.
+        let (next_noise, state_noise) = sample.noise.split_at_mut(*rows * action);
+        noise.fill_normal(next_noise);
+        noise.fill_normal(state_noise);
         sample.draw(self.isa, outputs);
     }
 
@@ -319,7 +323,8 @@ impl NativeSac {
         Ok(norms.map(f32::sqrt))
     }
 
-    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n,
+    /// observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let action = self.inputs.action.numbers();
         let mut outputs = vec![0.0; observations.len() / self.inputs.policy * 2 * action];

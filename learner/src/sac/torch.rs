@@ -120,7 +120,8 @@ impl TorchSac {
         )
     }
 
-    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n, observation]`.
+    /// Returns the policy's action without noise, `[n, action]`. `observations`: `[n,
+    /// observation]`.
     pub fn mode(&self, observations: &[f32]) -> Vec<f32> {
         let _guard = no_grad_guard();
         let observations = Tensor::from_slice(observations).view([-1, self.inputs.policy as i64]);

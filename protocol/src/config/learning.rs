@@ -54,12 +54,13 @@ pub struct LearningSection {
     /// Start levels of training, before it returns to the first; at least 1, at most the walls of
     /// the training course. Default 5, as in the paper.
     pub levels: u8,
-    /// Policy input per step: `latent`, `latent+velocity` or `latent+velocity+action`. Default
-    /// `latent`, as in the paper.
+    /// Policy input per step: `latent`, `latent+velocity` or `latent+velocity+action`, each also
+    /// with `+goal`. Default `latent`, as in the paper.
     pub observation: Observation,
     /// Earlier steps that the policy also sees, as rising numbers of steps back; at most 16. A step
-    /// is a `simulator.vehicle.control_period_secs`. Steps before the reset count as the reset. A wall seen a second ago is out of view when the drone
-    /// is in its opening. Default none, as in the paper.
+    /// is a `simulator.vehicle.control_period_secs`. Steps before the reset count as the reset. A
+    /// wall seen a second ago is out of view when the drone is in its opening. Default none, as in
+    /// the paper.
     pub history_steps: Vec<usize>,
     /// `true` stores every episode a second time, mirrored left to right. Twice the transitions
     /// come from the same steps; they fill the replay twice as fast. Default false, as in the
@@ -305,6 +306,84 @@ pub enum Observation {
     /// The above and the previous action.
     #[serde(rename = "latent+velocity+action")]
     LatentVelocityAction,
+    /// The latent code and the goal: its direction in the heading frame, and its distance.
+    #[serde(rename = "latent+goal")]
+    LatentGoal,
+    /// Latent code, velocity and goal.
+    #[serde(rename = "latent+velocity+goal")]
+    LatentVelocityGoal,
+    /// Latent code, velocity, previous action and goal.
+    #[serde(rename = "latent+velocity+action+goal")]
+    LatentVelocityActionGoal,
+}
+
+impl Observation {
+    /// All observations.
+    pub const ALL: [Self; 6] = [
+        Self::Latent,
+        Self::LatentVelocity,
+        Self::LatentVelocityAction,
+        Self::LatentGoal,
+        Self::LatentVelocityGoal,
+        Self::LatentVelocityActionGoal,
+    ];
+
+    /// Returns the name in the configuration.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Latent => "latent",
+            Self::LatentVelocity => "latent+velocity",
+            Self::LatentVelocityAction => "latent+velocity+action",
+            Self::LatentGoal => "latent+goal",
+            Self::LatentVelocityGoal => "latent+velocity+goal",
+            Self::LatentVelocityActionGoal => "latent+velocity+action+goal",
+        }
+    }
+
+    /// Returns `true` if the vehicle's velocity is seen.
+    pub fn has_velocity(self) -> bool {
+        !matches!(self, Self::Latent | Self::LatentGoal)
+    }
+
+    /// Returns `true` if the previous action is seen.
+    pub fn has_action(self) -> bool {
+        matches!(
+            self,
+            Self::LatentVelocityAction | Self::LatentVelocityActionGoal
+        )
+    }
+
+    /// Returns `true` if the goal is seen.
+    pub fn has_goal(self) -> bool {
+        matches!(
+            self,
+            Self::LatentGoal | Self::LatentVelocityGoal | Self::LatentVelocityActionGoal
+        )
+    }
+}
+
+/// Numbers of the goal: its direction, and its distance times [`GOAL_SCALE`].
+const GOAL: usize = 4;
+
+/// Factor that brings the goal's distance in metres to the size of the other numbers.
+pub const GOAL_SCALE: f32 = 0.05;
+
+/// Least distance of a goal whose direction is known, m.
+pub const LEAST_GOAL_M: f32 = 1e-3;
+
+/// One step as it may be seen.
+#[derive(Debug, Clone, Copy)]
+pub struct SeenStep<'a> {
+    /// Latent code of the depth image.
+    pub latent: &'a LatentCode,
+    /// Velocity in the world: forward, left, up, m/s.
+    pub velocity_mps: &'a [f32; 3],
+    /// Orientation, world from body, as a unit quaternion (i, j, k, w).
+    pub orientation: &'a [f32; 4],
+    /// Goal from the drone in the heading frame, m.
+    pub goal_m: &'a [f32; 3],
+    /// Action of the step before; zero at the reset.
+    pub previous_action: &'a Action,
 }
 
 /// Layout of the observation vector: the present step, then earlier ones. Actor and learner both
@@ -335,12 +414,11 @@ impl ObservationLayout {
 
     /// Returns the input length per step.
     pub fn step_len(&self) -> usize {
+        let part = |is_seen, len: usize| if is_seen { len } else { 0 };
         self.latent
-            + match self.per_step {
-                Observation::Latent => 0,
-                Observation::LatentVelocity => self.velocity_len(),
-                Observation::LatentVelocityAction => self.velocity_len() + self.action.numbers(),
-            }
+            + part(self.per_step.has_velocity(), self.velocity_len())
+            + part(self.per_step.has_action(), self.action.numbers())
+            + part(self.per_step.has_goal(), GOAL)
     }
 
     /// Returns how many numbers of the velocity are seen: 2, left and up, of a drone that flies
@@ -359,38 +437,36 @@ impl ObservationLayout {
         false
     }
 
-    /// Writes the input of one step: latent code, then parts of the vehicle's velocity and
-    /// `previous_action` (zero at reset). `velocity_mps`: in the world; `orientation`: world from
-    /// body, as a unit quaternion (i, j, k, w), for a drone that turns.
+    /// Writes the input of one step: latent code, then parts of velocity, previous action and goal.
     ///
     /// # Panics
     /// If `into` is not [`ObservationLayout::step_len`] long.
-    pub fn write_step(
-        &self,
-        code: &LatentCode,
-        velocity_mps: &[f32; 3],
-        orientation: &[f32; 4],
-        previous_action: &Action,
-        into: &mut [f32],
-    ) {
+    pub fn write_step(&self, step: &SeenStep<'_>, into: &mut [f32]) {
         assert_eq!(
             into.len(),
             self.step_len(),
             "the input per step has a fixed length"
         );
-        self.write_code(code, into);
-        let rest = &mut into[self.latent..];
-        let seen = self.velocity_len();
-        if self.per_step != Observation::Latent {
+        self.write_code(step.latent, into);
+        let mut rest = &mut into[self.latent..];
+        let mut put = |part: &[f32]| {
+            let (own, others) = std::mem::take(&mut rest).split_at_mut(part.len());
+            own.copy_from_slice(part);
+            rest = others;
+        };
+        if self.per_step.has_velocity() {
             let velocity = match self.action {
                 // The nose keeps pointing along the corridor.
-                ActionSpace::Lateral | ActionSpace::Velocity => *velocity_mps,
-                ActionSpace::VelocityYaw => in_heading_frame(*velocity_mps, *orientation),
+                ActionSpace::Lateral | ActionSpace::Velocity => *step.velocity_mps,
+                ActionSpace::VelocityYaw => in_heading_frame(*step.velocity_mps, *step.orientation),
             };
-            rest[..seen].copy_from_slice(&velocity[3 - seen..]);
+            put(&velocity[3 - self.velocity_len()..]);
         }
-        if self.per_step == Observation::LatentVelocityAction {
-            rest[seen..].copy_from_slice(&previous_action[..self.action.numbers()]);
+        if self.per_step.has_action() {
+            put(&step.previous_action[..self.action.numbers()]);
+        }
+        if self.per_step.has_goal() {
+            put(&goal_input(step.goal_m));
         }
     }
 
@@ -422,6 +498,72 @@ impl ObservationLayout {
             .zip(into.chunks_exact_mut(self.step_len()))
         {
             write_step(seen_step, into);
+        }
+    }
+}
+
+/// Returns direction and scaled distance of a goal that lies `goal_m` from the drone.
+fn goal_input(goal_m: &[f32; 3]) -> [f32; GOAL] {
+    let distance_m = goal_m.iter().map(|part| part * part).sum::<f32>().sqrt();
+    let [x, y, z] = goal_m.map(|part| part / distance_m.max(LEAST_GOAL_M));
+    [x, y, z, distance_m * GOAL_SCALE]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::MAX_LATENT;
+
+    #[test]
+    fn every_part_that_is_seen_has_its_place_and_its_frame() {
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        let step = SeenStep {
+            latent: &[0.5; MAX_LATENT],
+            velocity_mps: &[1.0, 2.0, 3.0],
+            // The nose points to the left.
+            orientation: &[0.0, 0.0, half, half],
+            goal_m: &[3.0, 0.0, 4.0],
+            previous_action: &[0.1, 0.2, 0.3, 0.4],
+        };
+        let written = |per_step, action| {
+            let layout = ObservationLayout {
+                action,
+                ..ObservationLayout::present(per_step, 2)
+            };
+            let mut vector = vec![f32::NAN; layout.step_len()];
+            layout.write_step(&step, &mut vector);
+            let rounded = vector.iter().map(|number| (number * 1e4).round() / 1e4);
+            rounded.collect::<Vec<f32>>()
+        };
+        let goal = [0.6, 0.0, 0.8, 0.25];
+        assert_eq!(
+            written(Observation::LatentVelocityActionGoal, ActionSpace::Lateral),
+            [&[0.5, 0.5, 2.0, 3.0, 0.1, 0.2][..], &goal].concat()
+        );
+        assert_eq!(
+            written(Observation::LatentVelocityGoal, ActionSpace::Velocity),
+            [&[0.5, 0.5, 1.0, 2.0, 3.0][..], &goal].concat()
+        );
+        assert_eq!(
+            written(Observation::LatentVelocityAction, ActionSpace::VelocityYaw),
+            [0.5, 0.5, 2.0, -1.0, 3.0, 0.1, 0.2, 0.3, 0.4]
+        );
+        assert_eq!(
+            written(Observation::LatentGoal, ActionSpace::Lateral),
+            [&[0.5, 0.5][..], &goal].concat()
+        );
+    }
+
+    #[test]
+    fn a_goal_that_is_reached_has_no_direction() {
+        assert_eq!(goal_input(&[0.0; 3]), [0.0; GOAL]);
+    }
+
+    #[test]
+    fn every_observation_is_called_as_in_the_configuration() {
+        for observation in Observation::ALL {
+            let text = toml::Value::from(observation.name());
+            assert_eq!(text.try_into::<Observation>().unwrap(), observation);
         }
     }
 }

@@ -33,7 +33,8 @@ pub use encoder::EncoderSection;
 pub use evaluation::{ConfirmOn, EvaluationSection};
 pub use file::{ConfigError, FILE_KEYS, failing_override, integer_too_large};
 pub use learning::{
-    AlgorithmName, CriticInput, EncoderTraining, LearningSection, Observation, ObservationLayout,
+    AlgorithmName, CriticInput, EncoderTraining, GOAL_SCALE, LEAST_GOAL_M, LearningSection,
+    Observation, ObservationLayout, SeenStep,
 };
 pub use replay::{ReplaySection, SuccessRule};
 pub use run::{CheckpointSection, Device, Engine, RunSection};

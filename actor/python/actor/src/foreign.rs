@@ -78,11 +78,13 @@ struct Limits {
     silence: Duration,
     most_records: usize,
     needs_ground_truth: bool,
+    needs_goal: bool,
 }
 
 /// State of the environment after a reset or a step, beside the image.
 struct Moment {
     velocity_mps: [f32; 3],
+    goal_m: [f32; 3],
     position_m: [f32; 3],
     orientation: [f32; 4],
     ground_truth: [f32; GROUND_TRUTH],
@@ -93,11 +95,12 @@ struct Moment {
     walls: u8,
 }
 
-/// A moment as `skein_rl/actor.py` hands it over: image, velocity, position, orientation, ground
-/// truth, terms of the reward, walls passed, wall hit, outcome, walls of the course.
+/// A moment as `skein_rl/actor.py` hands it over: image, velocity, goal, position, orientation,
+/// ground truth, terms of the reward, walls passed, wall hit, outcome, walls of the course.
 type Handed<'py> = (
     Bound<'py, PyBytes>,
     [f32; 3],
+    Option<[f32; 3]>,
     [f32; 3],
     [f32; 4],
     Option<[f32; GROUND_TRUTH]>,
@@ -126,10 +129,12 @@ impl<'a> ForeignWorlds<'a> {
                 silence: Duration::from_secs_f64(config.transport.actor_silence_secs),
                 most_records: config.transport.max_records_per_episode,
                 needs_ground_truth: config.learning.critic_input == CriticInput::GroundTruth,
+                needs_goal: config.learning.observation.has_goal(),
             },
             steps: 0,
             moment: Moment {
                 velocity_mps: [0.0; 3],
+                goal_m: [0.0; 3],
                 position_m: [0.0; 3],
                 orientation: [0.0, 0.0, 0.0, 1.0],
                 ground_truth: [0.0; GROUND_TRUTH],
@@ -168,8 +173,19 @@ impl<'a> ForeignWorlds<'a> {
     }
 
     fn take(&mut self, handed: Handed<'_>) -> PyResult<()> {
-        let (image, velocity, position, orientation, truth, terms, passed, hit, outcome, walls) =
-            handed;
+        let (
+            image,
+            velocity,
+            goal,
+            position,
+            orientation,
+            truth,
+            terms,
+            passed,
+            hit,
+            outcome,
+            walls,
+        ) = handed;
         let image = image.as_bytes();
         if image.len() != IMAGE_PIXELS {
             return Err(PyValueError::new_err(format!(
@@ -184,8 +200,15 @@ impl<'a> ForeignWorlds<'a> {
                  this run needs: add it, float32 [18], or train with \"observation\"",
             ));
         }
+        if goal.is_none() && self.limits.needs_goal {
+            return Err(PyValueError::new_err(
+                "the observation has no \"goal\", which learning.observation of this run needs: \
+                 add it, float32 [3], or train without \"+goal\"",
+            ));
+        }
         self.moment = Moment {
             velocity_mps: velocity,
+            goal_m: goal.unwrap_or([0.0; 3]),
             position_m: position,
             orientation,
             ground_truth: truth.unwrap_or([0.0; GROUND_TRUTH]),
@@ -263,6 +286,7 @@ impl World for ForeignWorlds<'_> {
         record.position_m = self.moment.position_m;
         record.orientation = self.moment.orientation;
         record.velocity_mps = self.moment.velocity_mps;
+        record.goal_m = self.moment.goal_m;
         record.ground_truth = self.moment.ground_truth;
     }
 
@@ -287,6 +311,8 @@ impl World for ForeignWorlds<'_> {
             },
             outcome: moment.outcome,
             hit: (moment.outcome == Some(EpisodeOutcome::Collided)).then_some(hit),
+            // Its reward is the environment's own.
+            ..StepReport::default()
         })
     }
 
@@ -306,13 +332,7 @@ impl World for ForeignWorlds<'_> {
     }
 
     fn reward(&self, _: &RewardSettings, _: &StepReport, _: &[u8; IMAGE_PIXELS]) -> RewardTerms {
-        let [collision, level_up, destination, open_view] = self.moment.reward_terms;
-        RewardTerms {
-            collision,
-            level_up,
-            destination,
-            open_view,
-        }
+        RewardTerms::from_values(self.moment.reward_terms)
     }
 
     fn walls(&self) -> u8 {

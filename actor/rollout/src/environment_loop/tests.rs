@@ -277,6 +277,7 @@ fn each_record_holds_the_observation_and_the_reward_of_its_step() {
             // This episode ends at the first wall.
             outcome: (pair[0].terminated == 1).then_some(EpisodeOutcome::Collided),
             hit: None,
+            ..StepReport::default()
         };
         let expected = RewardTerms::of(&RewardSettings::default(), &report, &pair[1].depth);
         assert_eq!(pair[0].reward_terms, expected.values());

@@ -16,7 +16,7 @@ mod mesh;
 mod motion;
 mod obstacle;
 mod opening;
-mod polygon;
+pub(crate) mod polygon;
 mod source_location;
 mod world;
 

@@ -11,11 +11,13 @@ mod ground_truth;
 mod passing_tests;
 mod reach;
 mod settings;
+mod surroundings;
 #[cfg(test)]
 mod tests;
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use rand::Rng;
 use skein_action::{Action, MAX_ACTION};
 
@@ -58,6 +60,8 @@ struct EpisodeState {
     /// Walls that the drone's tail has left, including those before its start.
     walls_behind: usize,
     walls_behind_at_start: usize,
+    /// Action of the step before; zero before the first.
+    last_action: Action,
     /// The drone's mass relative to its nominal mass.
     mass_factor: f32,
     /// Seed of the camera's errors; `None` in a calm episode.
@@ -111,6 +115,7 @@ impl Simulator {
                 steps: 0,
                 walls_behind: 0,
                 walls_behind_at_start: 0,
+                last_action: [0.0; MAX_ACTION],
                 mass_factor: 1.0,
                 depth_seed: None,
             },
@@ -161,6 +166,7 @@ impl Simulator {
             steps: 0,
             walls_behind,
             walls_behind_at_start: walls_behind,
+            last_action: [0.0; MAX_ACTION],
             mass_factor,
             depth_seed: disturbed.then_some(depth_seed),
         };
@@ -169,8 +175,8 @@ impl Simulator {
 
     /// Flies one control period with `action`: the numbers of
     /// [`VehicleSettings::action`](crate::vehicle::VehicleSettings::action) in order, each clamped
-    /// to [-1, 1]. Missing ones are 0, further ones are ignored. With latency, `action` takes effect
-    /// some steps later.
+    /// to [-1, 1]. Missing ones are 0, further ones are ignored. With latency, `action` takes
+    /// effect some steps later.
     ///
     /// If the body touches something, the episode ends at that physics step, within the control
     /// period, and the state is that of the contact.
@@ -187,8 +193,11 @@ impl Simulator {
         }
         self.episode.steps += 1;
         let walls_behind_before = self.episode.walls_behind;
+        let away_before_m = self.to_goal_m().norm();
 
-        let command = self.command(action)?;
+        let action = self.checked(action)?;
+        let before = std::mem::replace(&mut self.episode.last_action, action);
+        let command = self.vehicle_settings.command(&self.commands.pass(action));
         let contact = self.fly_until_contact(&command)?;
         let outcome = self.outcome(contact);
 
@@ -204,6 +213,11 @@ impl Simulator {
             },
             outcome,
             hit: (contact == Contact::Obstacle).then(|| self.obstacle()),
+            progress_m: away_before_m - self.to_goal_m().norm(),
+            clearance_m: surroundings::clearance_m(&self.course, &self.state().position_m)
+                .min(self.world.to_obstacle_m()),
+            effort: self.mean_square(&action, &[0.0; MAX_ACTION]),
+            effort_change: self.mean_square(&action, &before),
         })
     }
 
@@ -237,6 +251,13 @@ impl Simulator {
         };
         let command = oracle.command(self.world.tail_x_m(), &self.state());
         self.vehicle_settings.action_for(&command)
+    }
+
+    /// Returns the goal, the middle of the end wall or of a world's goal, as a vector from the drone
+    /// in the heading frame, m. A real drone has it from its own estimate.
+    #[must_use]
+    pub fn goal_m(&self) -> [f32; 3] {
+        self.state().in_heading_frame(&self.to_goal_m()).into()
     }
 
     /// Returns the ground truth of the current moment, which the camera does not show.
@@ -281,15 +302,30 @@ impl Simulator {
         &self.course
     }
 
-    fn command<const N: usize>(&mut self, action: [f32; N]) -> Result<Command, SimulationError> {
+    /// Returns the vector from the drone to the goal, world frame, m.
+    fn to_goal_m(&self) -> Vector3<f32> {
+        surroundings::goal(&self.course) - self.state().position_m
+    }
+
+    /// Returns the mean square of the differences between the numbers of two actions.
+    fn mean_square(&self, one: &Action, other: &Action) -> f32 {
+        let numbers = self.vehicle_settings.action.numbers();
+        let squares = one.iter().zip(other).take(numbers);
+        squares
+            .map(|(one, other)| (one - other).powi(2))
+            .sum::<f32>()
+            / numbers as f32
+    }
+
+    /// Returns `action` with all its numbers within their bounds.
+    fn checked<const N: usize>(&mut self, action: [f32; N]) -> Result<Action, SimulationError> {
         const { assert!(N <= MAX_ACTION, "an action has at most MAX_ACTION numbers") };
         if !action.iter().all(|v| v.is_finite()) {
             return Err(self.abort("action"));
         }
         let mut numbers = [0.0; MAX_ACTION];
         numbers[..N].copy_from_slice(&action.map(|v| v.clamp(-1.0, 1.0)));
-        let taken = self.commands.pass(numbers);
-        Ok(self.vehicle_settings.command(&taken))
+        Ok(numbers)
     }
 
     fn fly_until_contact(&mut self, command: &Command) -> Result<Contact, SimulationError> {
@@ -313,8 +349,8 @@ impl Simulator {
         Ok(Contact::Nothing)
     }
 
-    /// Counts the walls passed after a physics step that ended with `contact`. `counted`: walls that
-    /// earlier control periods counted.
+    /// Counts the walls passed after a physics step that ended with `contact`. `counted`: walls
+    /// that earlier control periods counted.
     fn count_walls(&mut self, contact: Contact, counted: usize) {
         let passed = self.episode.walls_behind;
         self.episode.walls_behind = match contact {

@@ -227,7 +227,7 @@ fn a_minibatch_is_a_function_of_content_and_seed() {
 #[test]
 fn rows_of_a_minibatch_belong_together() {
     for action in ActionSpace::ALL {
-        let mut config = config(100, Observation::LatentVelocityAction);
+        let mut config = config(256, Observation::LatentVelocityAction);
         config.learning.critic_input = CriticInput::GroundTruth;
         let action = format!("simulator.vehicle.action={}", action.name());
         let config = config

@@ -48,10 +48,10 @@ impl Model {
         for step in 0..episode.steps() {
             let moment = |step: usize| {
                 let mut vector = episode.observations[step].latent[..self.view.latent].to_vec();
-                if self.view.per_step != Observation::Latent {
+                if self.view.per_step.has_velocity() {
                     vector.extend(&episode.observations[step].velocity_mps[1..]);
                 }
-                if self.view.per_step == Observation::LatentVelocityAction {
+                if self.view.per_step.has_action() {
                     vector.extend(if step == 0 {
                         [0.0; 2]
                     } else {

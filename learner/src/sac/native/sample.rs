@@ -55,8 +55,8 @@ impl Sample {
     }
 
     /// Draws a = tanh(x), x = mean + std · noise, and computes log π(a) (arXiv:1812.05905, eq. 26).
-    /// `output`: the policy network's, `[rows, 2 · action]`: in each row the means, then the logarithms
-    /// of the standard deviations.
+    /// `output`: the policy network's, `[rows, 2 · action]`: in each row the means, then the
+    /// logarithms of the standard deviations.
     pub(super) fn draw(&mut self, isa: Isa, output: &[f32]) {
         let action = self.action;
         let rows = output.chunks_exact(2 * action);
@@ -107,9 +107,9 @@ impl Sample {
         }
     }
 
-    /// Computes the gradient with respect to the policy network's output, `[rows, 2 · action]`, for the rows
-    /// after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to each
-    /// log π, and `action_grad`, `[rows, action]`, with respect to the actions.
+    /// Computes the gradient with respect to the policy network's output, `[rows, 2 · action]`, for
+    /// the rows after the first `skipped`. Incoming gradients: `log_prob_gradient`, with respect to
+    /// each log π, and `action_grad`, `[rows, action]`, with respect to the actions.
     ///
     /// ∂log π/∂x = 2 tanh x; ∂a/∂x = 1 - tanh²x; ∂x/∂mean = 1; ∂x/∂log_std = std · noise; log_std
     /// also enters log π directly, ∂log π/∂log_std = -1. No gradient passes a bound of log_std.

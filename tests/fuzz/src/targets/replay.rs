@@ -128,6 +128,7 @@ pub(super) fn episode() -> CommittedEpisode {
     let seen = StepObservation {
         latent: [0.0; MAX_LATENT],
         velocity_mps: [0.0; 3],
+        goal_m: [0.0; 3],
         position_m: [0.0; 3],
         orientation: [0.0, 0.0, 0.0, 1.0],
         ground_truth: [0.0; GROUND_TRUTH],

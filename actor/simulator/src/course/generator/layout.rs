@@ -30,6 +30,10 @@ pub struct LayoutRanges {
     /// first wall, metres; drawn for each wall. Default 10.
     #[serde(deserialize_with = "exactly")]
     pub spacing_m: [f32; 2],
+    /// Distance from the corridor's start to the first wall, metres, if not as `spacing_m`.
+    /// Default: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_wall_m: Option<[f32; 2]>,
     /// Thickness of a course's walls, metres. Default 0.3.
     #[serde(deserialize_with = "exactly")]
     pub wall_thickness_m: [f32; 2],
@@ -46,7 +50,7 @@ pub struct LayoutRanges {
     #[serde(deserialize_with = "exactly")]
     pub start_jitter_z_m: [f32; 2],
     /// `true` puts the openings in turn into the left and the right half of the corridor. The walls
-    /// may then stand too close for a drone that flies on at 1 m/s: 1.7 m from back to front, where
+    /// may then stand too close for a drone that flies on at 1 m/s: 2 m from back to front, where
     /// one that hovers has room. Such courses need `vehicle.action = "velocity"`. Default false.
     pub slalom: bool,
 }
@@ -58,6 +62,7 @@ impl Default for LayoutRanges {
             height_m: [7.0; 2],
             walls: [5; 2],
             spacing_m: [10.0; 2],
+            first_wall_m: None,
             wall_thickness_m: [0.3; 2],
             end_m: [10.0; 2],
             start_offset_m: [1.5; 2],
@@ -161,10 +166,20 @@ impl LayoutRanges {
                 least_spacing_m,
                 (LARGEST_M - self.end_m[1]) / most_walls,
             ),
+            (
+                "layout.first_wall_m",
+                self.to_first_m(),
+                least_spacing_m,
+                LARGEST_M - self.end_m[1] - (most_walls - 1.0) * self.spacing_m[1],
+            ),
         ] {
             check_range(key, range, smallest, largest)?;
         }
         Ok(())
+    }
+
+    fn to_first_m(&self) -> [f32; 2] {
+        self.first_wall_m.unwrap_or(self.spacing_m)
     }
 
     /// Draws a corridor with at least `least_walls` walls, but not more than the ranges allow.
@@ -181,8 +196,12 @@ impl LayoutRanges {
         let walls = rng.random_range(least.max(least_walls).min(most)..=most);
         let mut front_m = 0.0;
         let wall_x_m: Vec<f32> = (0..walls)
-            .map(|_| {
-                front_m += rng.random_range(self.spacing_m[0]..=self.spacing_m[1]);
+            .map(|place| {
+                let [least, most] = match place {
+                    0 => self.to_first_m(),
+                    _ => self.spacing_m,
+                };
+                front_m += rng.random_range(least..=most);
                 front_m
             })
             .collect();
@@ -212,6 +231,7 @@ impl LayoutRanges {
             height_m: least(self.height_m),
             walls: [self.walls[1]; 2],
             spacing_m: least(self.spacing_m),
+            first_wall_m: self.first_wall_m.map(least),
             wall_thickness_m: most(self.wall_thickness_m),
             end_m: least(self.end_m),
             start_offset_m: most(self.start_offset_m),
@@ -224,7 +244,9 @@ impl LayoutRanges {
     /// Returns the longest corridor, and the start that lies farthest from its end.
     pub(super) fn longest(&self) -> (Corridor, StartArea) {
         let corridor = Corridor {
-            length_m: f32::from(self.walls[1]) * self.spacing_m[1] + self.end_m[1],
+            length_m: self.to_first_m()[1]
+                + f32::from(self.walls[1].saturating_sub(1)) * self.spacing_m[1]
+                + self.end_m[1],
             width_m: self.width_m[1],
             height_m: self.height_m[1],
         };

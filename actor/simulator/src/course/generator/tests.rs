@@ -101,6 +101,7 @@ fn varied() -> GeneratorRanges {
             start_offset_m: [1.2, 1.8],
             start_jitter_y_m: [0.2, 0.5],
             start_jitter_z_m: [0.2, 0.5],
+            first_wall_m: None,
             slalom: false,
         }),
         ..Default::default()
