@@ -19,7 +19,7 @@ use criterion::{BenchmarkGroup, Criterion, Throughput};
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 use skein_inference::{Network, Scratch};
-use skein_protocol::config::ObservationLayout;
+use skein_protocol::config::{ObservationLayout, SeenStep};
 use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::snapshot::SnapshotLayout;
@@ -154,12 +154,14 @@ fn inference(
     group.bench_function("policy", |bencher| {
         bencher.iter(|| {
             for record in episodes.iter().flat_map(|records| steps_of(records)) {
-                observation_layout.write_step(
-                    &record.latent,
-                    &record.velocity_mps,
-                    &[0.0; MAX_ACTION],
-                    &mut observed,
-                );
+                let seen = SeenStep {
+                    latent: &record.latent,
+                    velocity_mps: &record.velocity_mps,
+                    orientation: &record.orientation,
+                    goal_m: &record.goal_m,
+                    previous_action: &[0.0; MAX_ACTION],
+                };
+                observation_layout.write_step(&seen, &mut observed);
                 black_box(
                     network
                         .distribution(&observed, &mut scratch)

@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
@@ -263,6 +263,26 @@ fn the_goal_ends_an_episode_with_all_stages_passed_and_an_obstacle_ends_it_with_
     let (outcome, hit, passed) = flown(Course::of_world(layout(vec![wall])).unwrap(), 1);
     assert_eq!(outcome, EpisodeOutcome::Collided);
     assert_eq!(hit, Some(Hit::Wall(passed + 1)));
+}
+
+#[test]
+fn the_goal_and_the_nearest_obstacle_are_measured_from_the_drone() {
+    let course = Course::of_world(layout(vec![wall_with_gap(3.0)])).unwrap();
+    let mut simulator = Simulator::new(Arc::new(course), &SimulatorSettings::default()).unwrap();
+    let [mut start, mut calm] = [1, 0].map(Pcg64Mcg::seed_from_u64);
+    simulator.reset(1, &mut start, &mut calm).unwrap();
+    let to_goal_m = Point3::new(18.0, 0.0, 2.0) - simulator.state().position_m;
+    assert!((Vector3::from(simulator.goal_m()) - to_goal_m).norm() < 1e-5);
+    let report = loop {
+        let report = simulator.step([0.0, 0.0]).unwrap();
+        // The wall's front; half the drone's length before it, the episode ends.
+        let to_wall_m = 9.75 - simulator.state().position_m.x;
+        if to_wall_m < 1.3 {
+            assert!((report.clearance_m - to_wall_m).abs() < 1e-3);
+            break report;
+        }
+    };
+    assert_eq!(report.outcome, None);
 }
 
 #[test]
