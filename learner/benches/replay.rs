@@ -78,7 +78,7 @@ fn flown(number: u64, rng: &mut impl Rng) -> CommittedEpisode {
                 ground_truth: [0.0; GROUND_TRUTH],
             })
             .collect(),
-        actions: (0..STEPS).map(|_| [draw(), draw()]).collect(),
+        actions: (0..STEPS).map(|_| [draw(), draw(), 0.0, 0.0]).collect(),
         teacher_actions: vec![[0.0; MAX_ACTION]; STEPS],
         rewards: (0..STEPS).map(|_| draw()).collect(),
         reward_terms: vec![[0.0; REWARD_TERMS]; STEPS],
