@@ -104,7 +104,7 @@ impl SyntheticActor {
         for step in 0..STEPS {
             self.listen();
             let mut record = self.record(ticket, step);
-            record.action = [0.25, -0.25];
+            record.action = [0.25, -0.25, 0.0, 0.0];
             record.terminated = u8::from(step + 1 == STEPS);
             self.ports.send_transition(record).unwrap();
         }
