@@ -1,6 +1,11 @@
 //! The assumption of `learning.mirror`: mirrored commands in a mirrored course give the mirror
 //! image of the episode, image by image.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
+
 use std::sync::Arc;
 
 use rand::SeedableRng;

@@ -1,5 +1,10 @@
 //! Checks the claims of `configs/evaluations/slalom.toml`: who can fly it, and who cannot.
 
+#![allow(
+    clippy::unwrap_used,
+    reason = "a test's helpers fail by panicking, as tests do"
+)]
+
 use std::path::PathBuf;
 
 use rand::SeedableRng;

@@ -229,6 +229,7 @@ fn rows_of_a_minibatch_belong_together() {
     for action in ActionSpace::ALL {
         let mut config = config(256, Observation::LatentVelocityAction);
         config.learning.critic_input = CriticInput::GroundTruth;
+        config.learning.warmup_steps = 256;
         let action = format!("simulator.vehicle.action={}", action.name());
         let config = config
             .overridden(Path::new("config.toml"), &[action])
