@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io;
 
-use mcap::records::Record;
+use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use prost::Message;
 use serde::Serialize;
@@ -154,14 +154,17 @@ fn each_message(
             }
             LinearReadEvent::Record { opcode, data } => (opcode, data),
         };
-        match mcap::parse_record(opcode, data).map_err(damaged)? {
-            Record::Channel(channel) => {
+        match opcode {
+            op::CHANNEL => {
+                let (id, topic) = channel(data).ok_or_else(|| damaged("a channel"))?;
                 let mut known = Topic::ALL.into_iter();
-                let topic = known.find(|topic| topic.name() == channel.topic);
-                topics.insert(channel.id, topic);
+                topics.insert(id, known.find(|known| known.name().as_bytes() == topic));
             }
-            Record::Message { header, data } => {
-                if let Some(Some(topic)) = topics.get(&header.channel_id) {
+            op::MESSAGE => {
+                let record = mcap::parse_record(opcode, data).map_err(damaged)?;
+                if let Record::Message { header, data } = record
+                    && let Some(Some(topic)) = topics.get(&header.channel_id)
+                {
                     take(*topic, header.log_time, &data)?;
                 }
             }
@@ -169,6 +172,16 @@ fn each_message(
         }
     }
     Ok(())
+}
+
+/// Returns number and topic of a channel's record; `None` if it is cut off. `mcap::parse_record`
+/// allocates whatever length its texts state.
+fn channel(data: &[u8]) -> Option<(u16, &[u8])> {
+    let (id, rest) = data.split_first_chunk::<2>()?;
+    let (_schema_id, rest) = rest.split_first_chunk::<2>()?;
+    let (length, rest) = rest.split_first_chunk::<4>()?;
+    let topic = rest.get(..u32::from_le_bytes(*length) as usize)?;
+    Some((u16::from_le_bytes(*id), topic))
 }
 
 fn damaged(what: impl std::fmt::Display) -> io::Error {

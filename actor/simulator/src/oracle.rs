@@ -101,8 +101,8 @@ impl Oracle<'_> {
     ///
     /// It flies to the next opening's safe point, then, behind the last wall, to the middle of the
     /// corridor, where a gust has the longest way to blow it into anything. In a world, it flies
-    /// along the way to the goal, as far ahead as nothing stands between. It takes no notice of what
-    /// moves.
+    /// along the way to the goal, as far ahead as nothing stands between. It takes no notice of
+    /// what moves.
     pub(crate) fn command(&self, tail_x_m: f32, state: &VehicleState) -> Command {
         let turns = self.vehicle.action.axes().contains(&Axis::YawRate);
         let velocity = match turns {

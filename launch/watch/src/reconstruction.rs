@@ -231,9 +231,8 @@ mod tests {
         assert!(newest(plain).contains("no decoder in"));
         // Offsets beyond the file, and in the wrong order.
         for offsets in ["[0, 18446744073709551615]", "[99999999, 3]"] {
-            let header = format!(
-                "{{\"vae.parameters\":{{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":{offsets}}}}}"
-            );
+            let tensor = format!("{{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":{offsets}}}");
+            let header = format!("{{\"vae.parameters\":{tensor}}}");
             let length = (header.len() as u64).to_le_bytes();
             std::fs::write(&file, [&length[..], header.as_bytes()].concat()).unwrap();
             assert!(newest(plain).contains("no decoder in"));

@@ -86,7 +86,9 @@ impl<'a> Training<'a> {
             notify_user("there is no checkpoint yet: starting from the first episode");
         }
         let mut metrics = resume_metrics(directory, &saved, &disk)?;
-        metrics.describe(config)?;
+        if saved.episodes == 0 {
+            metrics.describe(config)?;
+        }
         let mut training = Self {
             config,
             identity,

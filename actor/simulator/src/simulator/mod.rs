@@ -253,8 +253,8 @@ impl Simulator {
         self.vehicle_settings.action_for(&command)
     }
 
-    /// Returns the goal, the middle of the end wall or of a world's goal, as a vector from the drone
-    /// in the heading frame, m. A real drone has it from its own estimate.
+    /// Returns the goal, the middle of the end wall or of a world's goal, as a vector from the
+    /// drone in the heading frame, m. A real drone has it from its own estimate.
     #[must_use]
     pub fn goal_m(&self) -> [f32; 3] {
         self.state().in_heading_frame(&self.to_goal_m()).into()
