@@ -296,10 +296,14 @@ fn a_second_learner_of_a_run_is_refused_and_the_first_continues() {
     let calm = calm();
     let mut run = recipe().start();
     run.until_episodes(10);
+    // So that the run is not over before the second one asks.
+    let first = run.process("skein-learner");
+    first.signal(Signal::STOP);
     let second = run_program(
         "skein-learner",
         &["--run", run.directory().root().to_str().unwrap()],
     );
+    first.signal(Signal::CONT);
     second.assert_refused(&["another learner"]);
     run.finish().assert_same_as(&calm);
 }

@@ -73,16 +73,19 @@ fn cells(of_seeds: &[&CourseEvaluation]) -> [String; HEADER.len() - 2] {
         summed(of_seeds, |course| course.failures.iter().map(by).collect())
     };
     let passed = summed(of_seeds, |course| course.walls_passed.clone());
-    let could_be_passed = sum(|course| course.episodes * course.walls_passed.len() as u64);
+    let episodes = sum(|course| course.episodes);
+    // Not from the counts: courses of one suite entry differ in their number of walls.
+    let weighted = |course: &&CourseEvaluation| course.r * course.episodes as f64;
+    let r = of_seeds.iter().map(weighted).sum::<f64>() / episodes as f64;
     let mut hit_wall = failed(|failures| failures.hit_wall);
     // No wall follows the last one.
     hit_wall.truncate(passed.len());
     [
         of_seeds.len().to_string(),
-        sum(|course| course.episodes).to_string(),
-        match could_be_passed {
+        episodes.to_string(),
+        match episodes {
             0 => NOTHING.to_owned(),
-            walls => format!("{:.3}", passed.iter().sum::<u64>() as f64 / walls as f64),
+            _ => format!("{r:.3}"),
         },
         joined(&passed),
         sum(|course| course.reached_end).to_string(),
@@ -128,13 +131,14 @@ mod tests {
 
     #[test]
     fn episodes_of_all_seeds_are_counted_where_they_ended() {
-        let score = |walls_passed, outcome, hit_wall| EpisodeScore {
+        let score_of = |walls, walls_passed, outcome, hit_wall| EpisodeScore {
             walls_passed,
-            walls: 2,
+            walls,
             episode_return: 0.0,
             outcome,
             hit_wall,
         };
+        let score = |walls_passed, outcome, hit_wall| score_of(2, walls_passed, outcome, hit_wall);
         let seeds = [
             CourseEvaluation::of(
                 "c",
@@ -157,5 +161,9 @@ mod tests {
             ["2", "4", "0.625", "3 2", "1", "0 1", "0 0 1", "1 0 0"]
         );
         assert_eq!(super::cells(&[])[2], NOTHING);
+        // Every wall of two courses is passed, one of them and then two.
+        let all = [1, 2].map(|walls| score_of(walls, walls, Outcome::ReachedEnd, None));
+        let course = CourseEvaluation::of("c", &all);
+        assert_eq!(super::cells(&[&course])[2..4], ["1.000", "2 1"]);
     }
 }
