@@ -160,10 +160,10 @@ def _check_spaces(env: gymnasium.Env[Any, Any]) -> None:
             raise ValueError(f"observation_space[{name!r}] has the shape {found}, not {shape}")
     if spaces["depth"].dtype != np.uint8:
         raise ValueError(f"observation_space[\"depth\"] has {spaces['depth'].dtype}, not uint8")
-    shape = env.action_space.shape
-    if shape is None or len(shape) != 1 or not 2 <= shape[0] <= 4:
+    actions = env.action_space.shape
+    if actions is None or len(actions) != 1 or not 2 <= actions[0] <= 4:
         raise ValueError(
-            f"action_space has the shape {shape}, not (2,), (3,) or (4,): the numbers of the run's "
+            f"action_space has the shape {actions}, not (2,), (3,) or (4,): the numbers of the run's "
             "simulator.vehicle.action, in [-1, 1]"
         )
 

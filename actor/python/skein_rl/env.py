@@ -189,7 +189,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
 
     def _frame(self) -> npt.NDArray[np.uint8]:
         try:
-            return render.frame(self._open(), 0)
+            return render.frame(self._open(), 0, self._task)
         except RuntimeError as error:
             raise ResetNeeded(str(error)) from None
 

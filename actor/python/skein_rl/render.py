@@ -26,10 +26,10 @@ def check_mode(mode: str | None, modes: Sequence[str]) -> None:
         raise ValueError(f"render_mode = {mode!r} is none of {', '.join(modes)}")
 
 
-def frame(fleet: _core.Fleet, index: int) -> npt.NDArray[np.uint8]:
+def frame(fleet: _core.Fleet, index: int, task: _core.Task) -> npt.NDArray[np.uint8]:
     """Draws environment ``index``, uint8 ``[288, 512, 3]``."""
     behind, eye = fleet.chase(index)
-    now = arrays(fleet.view(index), 1, 0)
+    now = arrays(fleet.view(index), 1, task)
     image = _coloured(np.frombuffer(behind, np.uint8).reshape(IMAGE))
     image = image.repeat(_SCALE, 0).repeat(_SCALE, 1)
     _draw_drone(image, now["position_m"][0] - np.array(eye), now["orientation"][0])

@@ -150,7 +150,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         if self.render_mode is None:
             return None
         fleet = self._open()
-        return tuple(render.frame(fleet, index) for index in range(self.num_envs))
+        return tuple(render.frame(fleet, index, self._task) for index in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Frees the simulators."""
