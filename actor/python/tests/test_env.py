@@ -162,7 +162,7 @@ def test_a_recorded_episode_is_flown_again_by_its_actions(recording, policy):
     recorded = skein_rl.read_recording(recording)
     files = sorted((CONFIGS / "courses").glob("*.toml"))
     env = skein_rl.CorridorEnv(courses=files, simulator=policy.simulator)
-    seeds = evaluation_seeds(2)
+    seeds = evaluation_seeds(policy.config["run"]["seed"], 2)
     for episode in recorded.episodes():
         course, number = int(episode["course"][0]), int(episode["episode"][0])
         observation, _ = env.reset(seed=seeds[number], options={"course": course})
@@ -174,11 +174,11 @@ def test_a_recorded_episode_is_flown_again_by_its_actions(recording, policy):
         assert terminated or truncated
 
 
-def evaluation_seeds(count):
-    """Seeds of evaluation episodes of a run of seed 1: xxh3 of purpose 2 and the index."""
+def evaluation_seeds(run_seed, count):
+    """Seeds of a run's evaluation episodes: xxh3 of purpose 2 and the index."""
     xxhash = pytest.importorskip("xxhash")
     places = ((2).to_bytes(8, "little") + n.to_bytes(8, "little") for n in range(count))
-    return [xxhash.xxh3_64_intdigest(place, seed=1) for place in places]
+    return [xxhash.xxh3_64_intdigest(place, seed=run_seed) for place in places]
 
 
 def test_settings_come_from_keywords_and_files(tmp_path):
