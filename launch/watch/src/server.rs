@@ -18,7 +18,7 @@ use axum::http::{HeaderValue, StatusCode};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{MethodRouter, get};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio_stream::wrappers::IntervalStream;
@@ -101,41 +101,22 @@ fn router(catalogue: Catalogue, port: u16) -> Router {
                 asset("text/javascript", shared.plotly.clone())
             }),
         )
-        .route(
-            "/api/runs",
-            get(async |state, query| answer(state, query, list).await),
-        )
-        .route(
-            "/api/run",
-            get(async |state, query| answer(state, query, describe).await),
-        )
-        .route(
-            "/api/curves",
-            get(async |state, query| answer(state, query, curves).await),
-        )
-        .route(
-            "/api/flights",
-            get(async |state, query| answer(state, query, flights).await),
-        )
-        .route(
-            "/api/recordings",
-            get(async |state, query| answer(state, query, list_recordings).await),
-        )
-        .route(
-            "/api/recording",
-            get(async |state, query| answer(state, query, recording).await),
-        )
-        .route(
-            "/api/images",
-            get(async |state, query| answer(state, query, images).await),
-        )
-        .route(
-            "/api/reconstructions",
-            get(async |state, query| answer(state, query, reconstructions).await),
-        )
+        .route("/api/runs", api(list))
+        .route("/api/run", api(describe))
+        .route("/api/curves", api(curves))
+        .route("/api/flights", api(flights))
+        .route("/api/recordings", api(list_recordings))
+        .route("/api/recording", api(recording))
+        .route("/api/images", api(images))
+        .route("/api/reconstructions", api(reconstructions))
         .route("/api/changes", get(changes))
         .with_state(shared)
         .layer(from_fn_with_state(port, guard))
+}
+
+/// Returns the route of the requests that `make` answers.
+fn api(make: Make) -> MethodRouter<Arc<Shared>> {
+    get(async move |state, query| answer(state, query, make).await)
 }
 
 /// Returns plotly's script out of the HTML that its crate embeds it in.
@@ -188,6 +169,8 @@ fn is_own(headers: &HeaderMap, port: u16) -> bool {
 }
 
 type Parameters = Vec<(String, String)>;
+/// Makes the answer to a request.
+type Make = fn(&Shared, &Parameters) -> anyhow::Result<Content>;
 
 /// Content of an answer.
 enum Content {
@@ -206,7 +189,7 @@ impl From<Value> for Content {
 async fn answer(
     State(shared): State<Arc<Shared>>,
     Query(parameters): Query<Parameters>,
-    make: fn(&Shared, &Parameters) -> anyhow::Result<Content>,
+    make: Make,
 ) -> Response {
     let made = tokio::task::spawn_blocking(move || make(&shared, &parameters)).await;
     let (status, value) = match made {

@@ -157,7 +157,7 @@ struct WallTable {
 
 /// Corner `[y, z]` of a polygon.
 #[derive(Deserialize)]
-struct Corner(#[serde(deserialize_with = "exactly")] [f32; 2]);
+pub(super) struct Corner(#[serde(deserialize_with = "exactly")] pub(super) [f32; 2]);
 
 #[derive(Clone, Copy, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -6,6 +6,7 @@ use serde::Deserialize;
 
 use super::mesh_file::{self, MeshScale};
 use super::{Region, Sides, WorldFault, WorldLayout, WorldRanges};
+use crate::course::file::Corner;
 use crate::course::{
     Corridor, Course, CourseError, CourseFault, Motion, Obstacle, ObstacleShape, Opening, Shape,
 };
@@ -141,10 +142,6 @@ struct OpeningTable {
     diameter_m: Option<f32>,
     points_m: Option<Vec<Corner>>,
 }
-
-/// Corner `[y, z]` of a polygon.
-#[derive(Deserialize)]
-struct Corner(#[serde(deserialize_with = "exactly")] [f32; 2]);
 
 /// Contents of a `motion`.
 #[derive(Clone, Copy, Deserialize)]
