@@ -257,12 +257,18 @@ fn write(flown: &Flown, path: &Path, courses: &Courses, lengths: RecordLengths) 
         lengths,
         score: flown.score,
     };
-    let written = Recording::create(&unfinished, settings, lengths.action, &[course.name()])
-        .and_then(|mut recording| {
-            recording.add(&episode, &flown.records)?;
-            recording.finish()
-        })
-        .and_then(|()| fs::rename(&unfinished, path));
+    let written = Recording::create(
+        &unfinished,
+        settings,
+        lengths.action,
+        &[course.name()],
+        None,
+    )
+    .and_then(|mut recording| {
+        recording.add(&episode, &flown.records)?;
+        recording.finish()
+    })
+    .and_then(|()| fs::rename(&unfinished, path));
     if written.is_err() {
         // If there is none, removing it does nothing.
         let _ = fs::remove_file(&unfinished);

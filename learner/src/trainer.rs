@@ -10,6 +10,7 @@ use rand_pcg::Pcg64Mcg;
 use skein_inference::{Encoder, encoder};
 use skein_kernels::{Isa, Team};
 use skein_protocol::config::{AlgorithmName, Config, Engine};
+use skein_protocol::decoder_file::TrainedDecoder;
 use skein_protocol::encoder_file::{EncoderError, TrainedEncoder};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::policy_file::{PolicyError, start_policy};
@@ -480,6 +481,20 @@ impl Trainer {
                 .map(|depth| (depth * 255.0).round_ties_even() as u8)
                 .collect(),
         )
+    }
+
+    /// Returns the VAE's decoder as it is now; `None` without a VAE, or if the decoder needs more
+    /// than the code.
+    pub(crate) fn decoder(&self) -> Option<TrainedDecoder> {
+        let vae = self.source.vae()?;
+        let latent = self.config.vae.latent;
+        let mut values = vec![0.0; vae.published_len()];
+        vae.publish(&mut values);
+        Some(TrainedDecoder {
+            values: vae.decoder_values()?,
+            latent,
+            encoder_sha256: TrainedEncoder { values, latent }.sha256(),
+        })
     }
 
     /// Copies all tensors that updates change.

@@ -70,6 +70,8 @@ struct Training<'a> {
     saved: TrainingProgress,
     /// Snapshots in the newest checkpoint.
     saved_snapshots: BTreeMap<PolicyVersion, Snapshot>,
+    /// VAE steps of the decoder in its file; `None` before this incarnation has written it.
+    decoder_saved: Option<u64>,
     /// Number of earlier incarnations of the learner.
     resumes: u64,
     /// Epochs or segments that are ordered but not learned from.

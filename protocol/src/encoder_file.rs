@@ -5,6 +5,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
+use safetensors::Dtype;
 use sha2::{Digest, Sha256};
 
 use crate::config::Config;
@@ -113,7 +114,7 @@ impl TrainedEncoder {
     fn parse_file(file: &ParameterFile<'_>) -> Result<Self, String> {
         let config = file.config()?;
         let layout = SnapshotLayout::of(&config);
-        let values = file.values(layout.encoder_tensors())?;
+        let values = file.values(layout.encoder_tensors(), Dtype::F32)?;
         let texts = [STEPS_KEY, VERSION_KEY, CONFIG_KEY].map(|key| file.text(key));
         let [steps, version, config_text] = texts;
         file.check(&[steps?, version?, config_text?], &values)?;
@@ -140,7 +141,7 @@ impl TrainedEncoder {
             (CONFIG_KEY.to_owned(), config_text),
         ]);
         let layout = SnapshotLayout::of(config);
-        write_tensors(layout.encoder_tensors(), &self.values, metadata)
+        write_tensors(layout.encoder_tensors(), &self.values, Dtype::F32, metadata)
     }
 
     /// Returns the SHA-256 of the parameters' bytes in hexadecimal.

@@ -8,6 +8,7 @@
 //! and processes.
 
 pub mod config;
+pub mod decoder_file;
 pub mod encoder_file;
 pub mod evaluation;
 pub mod files;

@@ -11,6 +11,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use bytemuck::{Pod, Zeroable};
+use half::f16;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use sha2::{Digest, Sha256};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
@@ -340,7 +341,7 @@ impl Snapshot {
             (VERSION_KEY.to_owned(), version),
             (CONFIG_KEY.to_owned(), config),
         ]);
-        write_tensors(layout.tensors(), &self.values, metadata)
+        write_tensors(layout.tensors(), &self.values, Dtype::F32, metadata)
     }
 
     /// Reads a snapshot file and the configuration it was trained with. That configuration holds
@@ -401,21 +402,22 @@ pub(crate) fn checksum(texts: &[&str], values: &[f32]) -> String {
 ///
 /// # Panics
 /// If there are fewer `values` than the tensors hold.
-pub(crate) fn write_tensors(
+pub(crate) fn write_tensors<T: Pod>(
     tensors: &[TensorSpec],
-    values: &[f32],
+    values: &[T],
+    dtype: Dtype,
     metadata: HashMap<String, String>,
 ) -> Vec<u8> {
     let views = tensors.iter().map(|tensor| {
         let bytes = bytemuck::cast_slice(&values[tensor.range.clone()]);
-        let view = TensorView::new(Dtype::F32, tensor.shape.clone(), bytes)
+        let view = TensorView::new(dtype, tensor.shape.clone(), bytes)
             .expect("a tensor's range is as long as its shape says");
         (tensor.name.clone(), view)
     });
     safetensors::serialize(views, Some(metadata)).expect("names and shapes are plain data")
 }
 
-/// A file of named f32 tensors, with a configuration and a checksum in its metadata.
+/// A file of named tensors, with a configuration and a checksum in its metadata.
 pub(crate) struct ParameterFile<'a> {
     metadata: HashMap<String, String>,
     tensors: SafeTensors<'a>,
@@ -446,22 +448,25 @@ impl<'a> ParameterFile<'a> {
         Ok(config)
     }
 
-    /// Returns the finite values of `tensors`, back to back.
-    pub(crate) fn values(&self, tensors: &[TensorSpec]) -> Result<Vec<f32>, String> {
+    /// Returns the finite values of `tensors`, back to back, which the file holds as `dtype`.
+    pub(crate) fn values(&self, tensors: &[TensorSpec], dtype: Dtype) -> Result<Vec<f32>, String> {
         let mut values = Vec::new();
         for tensor in tensors {
             let view = self.tensors.tensor(&tensor.name);
             let view = view.map_err(|error| error.to_string())?;
-            if view.dtype() != Dtype::F32 || view.shape() != tensor.shape {
+            if view.dtype() != dtype || view.shape() != tensor.shape {
                 return Err(format!(
-                    "{} is {:?} {:?}, not F32 {:?}",
+                    "{} is {:?} {:?}, not {dtype:?} {:?}",
                     tensor.name,
                     view.dtype(),
                     view.shape(),
                     tensor.shape
                 ));
             }
-            values.extend(values_of(view.data()));
+            match dtype {
+                Dtype::F16 => values.extend(halves_of(view.data())),
+                _ => values.extend(values_of(view.data())),
+            }
         }
         check_finite(tensors, &values).map_err(|error| error.to_string())?;
         Ok(values)
@@ -492,7 +497,7 @@ fn parse_file(bytes: &[u8]) -> Result<(Snapshot, Config), String> {
     let number = version.parse();
     let number = number.map_err(|_| format!("its {VERSION_KEY} is not a number"))?;
     let config = file.config()?;
-    let values = file.values(SnapshotLayout::of(&config).tensors())?;
+    let values = file.values(SnapshotLayout::of(&config).tensors(), Dtype::F32)?;
     file.check(&[version, file.text(CONFIG_KEY)?], &values)?;
     let version = PolicyVersion(number);
     Ok((Snapshot { version, values }, config))
@@ -517,6 +522,12 @@ fn values_of(bytes: &[u8]) -> Vec<f32> {
         .chunks_exact(4)
         .map(|chunk| f32::from_le_bytes([chunk[0], chunk[1], chunk[2], chunk[3]]))
         .collect()
+}
+
+/// Reads values of half precision from bytes that need not be aligned.
+fn halves_of(bytes: &[u8]) -> impl Iterator<Item = f32> {
+    let (halves, _) = bytes.as_chunks();
+    halves.iter().map(|half| f16::from_le_bytes(*half).to_f32())
 }
 
 #[cfg(test)]

@@ -11,6 +11,8 @@ use std::path::Path;
 use std::process::Command;
 
 use skein_protocol::config::Config;
+use skein_protocol::decoder_file::TrainedDecoder;
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{Stage, ThreadRole};
 use skein_protocol::summary::RunEnding;
@@ -258,6 +260,9 @@ fn the_snapshots_are_those_of_the_summary(run: &EndedRun) {
     let (best, config) = Snapshot::load(&run.directory.best_snapshot()).unwrap();
     assert_eq!(Some(best.version), summary.best_version);
     assert_eq!(config.run.seed, 7, "a snapshot carries its configuration");
+    let encoder = TrainedEncoder::load(&run.directory.latest_snapshot()).unwrap();
+    let decoder = TrainedDecoder::of(&encoder.sha256(), &run.directory.decoder()).unwrap();
+    assert!(decoder.is_some(), "the decoder is the newest encoder's");
 }
 
 fn the_evaluation_is_of_the_best_snapshot(run: &EndedRun) {

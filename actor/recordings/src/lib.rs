@@ -18,6 +18,7 @@ use std::path::Path;
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 use prost::Message;
+use skein_inference::Decoder;
 use skein_protocol::evaluation::EpisodeScore;
 use skein_protocol::transition::{Outcome, RecordLengths, TransitionRecord};
 use skein_protocol::{ActionSpace, REWARD_TERM_NAMES};
@@ -59,6 +60,8 @@ enum Topic {
     Image,
     /// The same in millimetres.
     Depth,
+    /// The depth image that the decoder makes of the latent code.
+    Reconstruction,
     Calibration,
     Frames,
     Scene,
@@ -66,11 +69,12 @@ enum Topic {
 }
 
 impl Topic {
-    const ALL: [Self; 8] = [
+    const ALL: [Self; 9] = [
         Self::Step,
         Self::Reward,
         Self::Image,
         Self::Depth,
+        Self::Reconstruction,
         Self::Calibration,
         Self::Frames,
         Self::Scene,
@@ -83,6 +87,7 @@ impl Topic {
             Self::Reward => "/drone/reward",
             Self::Image => "/camera/image",
             Self::Depth => "/camera/depth",
+            Self::Reconstruction => "/camera/reconstruction",
             Self::Calibration => "/camera/calibration",
             Self::Frames => "/frames",
             Self::Scene => "/scene",
@@ -94,7 +99,7 @@ impl Topic {
         match self {
             Self::Step => schemas::step(),
             Self::Reward => schemas::reward(),
-            Self::Image | Self::Depth => schemas::RAW_IMAGE,
+            Self::Image | Self::Depth | Self::Reconstruction => schemas::RAW_IMAGE,
             Self::Calibration => schemas::CAMERA_CALIBRATION,
             Self::Frames => schemas::FRAME_TRANSFORMS,
             Self::Scene => schemas::SCENE_UPDATE,
@@ -106,6 +111,7 @@ impl Topic {
 /// An MCAP file under way.
 pub struct Recording<'a> {
     settings: &'a SimulatorSettings,
+    decoder: Option<&'a Decoder>,
     writer: Writer<BufWriter<File>>,
     /// Number of each topic of [`Topic::ALL`] in the file.
     channels: Vec<u16>,
@@ -121,7 +127,8 @@ pub struct Recording<'a> {
 }
 
 impl<'a> Recording<'a> {
-    /// Creates the file `path` of flights with `settings` and `action` through `courses`.
+    /// Creates the file `path` of flights with `settings` and `action` through `courses`. With a
+    /// `decoder`, every step has the image that it makes of the latent code.
     ///
     /// # Errors
     /// Of the file.
@@ -130,6 +137,7 @@ impl<'a> Recording<'a> {
         settings: &'a SimulatorSettings,
         action: ActionSpace,
         courses: &[&str],
+        decoder: Option<&'a Decoder>,
     ) -> io::Result<Self> {
         let options = WriteOptions::new()
             .library(concat!("skein ", env!("CARGO_PKG_VERSION")))
@@ -146,6 +154,7 @@ impl<'a> Recording<'a> {
         }
         let mut recording = Self {
             settings,
+            decoder,
             writer,
             channels,
             sequence: 0,
@@ -219,6 +228,11 @@ impl<'a> Recording<'a> {
         let range_m = self.settings.camera.range_m;
         let depth = RawImage::in_millimetres(&record.depth, range_m, self.now);
         self.send(Topic::Depth, &depth)?;
+        if let Some(decoder) = self.decoder {
+            let image = decoder.decode(&record.latent[..row.lengths.latent]);
+            let image = RawImage::of_depth(&image, self.now);
+            self.send(Topic::Reconstruction, &image)?;
+        }
         self.send_bytes(Topic::Step, &encode_step(row))?;
         self.send_bytes(Topic::Reward, &encode_reward(record))?;
         let before_m = self.before_m.replace(record.position_m);

@@ -264,7 +264,7 @@ mod tests {
         let path = folder.path().join("two.mcap");
         let settings = SimulatorSettings::default();
         let mut recording =
-            Recording::create(&path, &settings, LENGTHS.action, &["a course"]).unwrap();
+            Recording::create(&path, &settings, LENGTHS.action, &["a course"], None).unwrap();
         for number in 0..2u8 {
             let records = (0..3u8).map(|step| {
                 let mut record = Box::new(TransitionRecord::zeroed());

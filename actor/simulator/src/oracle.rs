@@ -228,13 +228,17 @@ mod tests {
     #[test]
     fn every_shipped_course_can_be_flown_from_every_level_with_every_drone() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/courses");
-        let files: Vec<_> = folder
-            .read_dir()
-            .unwrap()
-            .map(|entry| entry.unwrap().path())
-            .collect();
+        let entries = |folder: &Path| {
+            folder
+                .read_dir()
+                .unwrap()
+                .map(|entry| entry.unwrap().path())
+        };
+        let (folders, mut files): (Vec<_>, Vec<_>) =
+            entries(&folder).partition(|path| path.is_dir());
+        files.extend(folders.iter().flat_map(|folder| entries(folder)));
         assert!(
-            files.len() >= 4,
+            files.len() >= 12,
             "the shipped courses are missing: {files:?}"
         );
         for file in files {

@@ -5,10 +5,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context;
+use skein_inference::Decoder;
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::transition::TransitionRecord;
-use skein_reports::flight::{FlightStep, draw_flight};
+use skein_reports::flight::{CodeView, FlightStep, draw_flight};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::{Evaluation, Keep};
 
@@ -21,6 +22,7 @@ pub(crate) fn draw(
     snapshot: &Snapshot,
     config: &Config,
     courses: Courses,
+    decoder: Option<&Decoder>,
     file: &Path,
 ) -> anyhow::Result<()> {
     let courses = Arc::new(courses);
@@ -38,15 +40,25 @@ pub(crate) fn draw(
         .context("there is no episode to draw")?;
     let course = entry.courses.of_episode(0)?;
     let latent = config.vae.latent;
-    let steps: Vec<_> = episode.records.iter().map(|at| step(at, latent)).collect();
+    let codes = episode.records.iter().map(|at| &at.latent[..latent]);
+    let images: Option<Vec<_>> =
+        decoder.map(|decoder| codes.map(|code| decoder.decode(code)).collect());
+    let views = episode.records.iter().enumerate().map(|(number, record)| {
+        let numbers = CodeView::Numbers(&record.latent[..latent]);
+        let image = images
+            .as_ref()
+            .map(|images| CodeView::Image(&images[number]));
+        step(record, image.unwrap_or(numbers))
+    });
+    let steps: Vec<_> = views.collect();
     Ok(draw_flight(&course, &steps, &entry.name, file)?)
 }
 
-fn step(record: &TransitionRecord, latent: usize) -> FlightStep<'_> {
+fn step<'a>(record: &'a TransitionRecord, code: CodeView<'a>) -> FlightStep<'a> {
     FlightStep {
         position_m: record.position_m,
         depth: &record.depth,
-        latent: &record.latent[..latent],
+        code,
         walls_passed: record.walls_passed,
     }
 }

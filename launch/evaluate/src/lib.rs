@@ -22,11 +22,14 @@ use crate::settings::{Flown, with_overrides};
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 use serde::Serialize;
+use skein_inference::Decoder;
 use skein_kernels::Isa;
 use skein_protocol::config::{Config, failing_override};
+use skein_protocol::decoder_file::{DECODER_FILE, TrainedDecoder};
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::files::destination;
-use skein_protocol::snapshot::Snapshot;
+use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::transition::RecordLengths;
 use skein_reports::{MOST_DRAWN, unfinished_picture};
 use skein_rollout::courses::Courses;
@@ -96,7 +99,7 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE")]
     failures: Option<PathBuf>,
     /// Also draw the first episode to this file as it flies, as GIF: from above, from the side,
-    /// its depth image, and the latent code. Five times as fast as flown.
+    /// its depth image, and what the latent code keeps of it. Five times as fast as flown.
     #[arg(long, value_name = "FILE")]
     gif: Option<PathBuf>,
     // Not a doc comment, which cannot contain the constant.
@@ -159,6 +162,11 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let episodes = courses.evaluation().map(|entry| entry.episodes).sum();
         check_recording(episodes, courses.most_records(), free_memory())?;
     }
+    let decoder = match arguments.record.is_some() || arguments.gif.is_some() {
+        true => decoder(&arguments.subject, &path, &snapshot, &config)?,
+        false => None,
+    };
+    let decoder = decoder.as_ref();
     let courses = Arc::new(courses);
     let threads = arguments
         .threads
@@ -223,7 +231,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         write_json(file, &report)
     });
     let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
-        record(file, &courses, config.record_lengths(), &evaluated.episodes)
+        let lengths = config.record_lengths();
+        record(file, &courses, lengths, decoder, &evaluated.episodes)
     });
     let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
         plot::draw(&courses, &evaluated.episodes, file)
@@ -234,7 +243,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .map(|file| failures::draw(&courses, &evaluated.episodes, file, stdout_columns()));
     let filmed = arguments.gif.as_ref().map_or(Ok(()), |file| {
         let again = self::courses(arguments, &config, &path)?.with_episodes(1);
-        film::draw(&snapshot, &config, again, file)
+        film::draw(&snapshot, &config, again, decoder, file)
     });
     show!("{}", evaluation_table(&evaluated.report, stdout_columns()));
     written?;
@@ -252,17 +261,39 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Returns the decoder of the snapshot's latent codes, if a run or the folder of the snapshot has
+/// it.
+fn decoder(
+    subject: &Subject,
+    path: &Path,
+    snapshot: &Snapshot,
+    config: &Config,
+) -> anyhow::Result<Option<Decoder>> {
+    let file = match &subject.run {
+        Some(run) => RunDirectory::new(run).decoder(),
+        None => path.with_file_name(DECODER_FILE),
+    };
+    let encoder = TrainedEncoder {
+        values: snapshot.values[SnapshotLayout::of(config).encoder()].to_vec(),
+        latent: config.vae.latent,
+    };
+    let trained = TrainedDecoder::of(&encoder.sha256(), &file)
+        .context("this file is only for what latent codes hold: remove it to do without")?;
+    Ok(trained.map(|trained| Decoder::new(Isa::best(), &trained)))
+}
+
 /// Writes a recording in the format that the file's name asks for.
 fn record(
     file: &Path,
     courses: &Courses,
     lengths: RecordLengths,
+    decoder: Option<&Decoder>,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
     match file.extension() {
-        Some(extension) if extension == "mcap" => {
-            write_atomically(file, |file| mcap::write(file, courses, lengths, episodes))
-        }
+        Some(extension) if extension == "mcap" => write_atomically(file, |file| {
+            mcap::write(file, courses, lengths, decoder, episodes)
+        }),
         _ => {
             let entries = courses.evaluation();
             let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();

@@ -3,6 +3,7 @@
 use std::io;
 use std::path::Path;
 
+use skein_inference::Decoder;
 use skein_protocol::transition::RecordLengths;
 use skein_recordings::{Episode, Recording};
 use skein_rollout::courses::Courses;
@@ -16,11 +17,13 @@ pub(crate) fn write(
     path: &Path,
     courses: &Courses,
     lengths: RecordLengths,
+    decoder: Option<&Decoder>,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> io::Result<()> {
     let entries = courses.evaluation();
     let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
-    let mut recording = Recording::create(path, courses.settings(), lengths.action, &names)?;
+    let mut recording =
+        Recording::create(path, courses.settings(), lengths.action, &names, decoder)?;
     for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
         for (number, episode) in (0..).zip(episodes) {
             let course = entry.courses.of_episode(number);

@@ -10,9 +10,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use skein_protocol::config::Config;
+use skein_protocol::decoder_file::TrainedDecoder;
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::evaluation::{CourseEvaluation, EvaluationReport, WallFailures};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_run::RunDirectory;
 
 fn shipped(course: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -212,6 +215,53 @@ fn an_mcap_recording_has_every_observation_of_the_npz_with_its_image_and_its_num
         of("/events").len() >= 8,
         "each of four episodes begins and ends"
     );
+    assert!(of("/camera/reconstruction").is_empty(), "no decoder");
+}
+
+#[test]
+fn a_recording_and_a_moving_picture_show_what_the_decoder_makes_of_the_codes() {
+    let folder = run_folder();
+    let at = folder.path();
+    let run = RunDirectory::new(at);
+    let encoder = TrainedEncoder::load(&run.latest_snapshot()).unwrap();
+    let mut decoder = TrainedDecoder {
+        values: vec![
+            0.0;
+            TrainedDecoder::tensors(encoder.latent)
+                .last()
+                .unwrap()
+                .range
+                .end
+        ],
+        latent: encoder.latent,
+        encoder_sha256: "another encoder's".to_owned(),
+    };
+    let reconstructions = |decoder: &TrainedDecoder| {
+        std::fs::write(run.decoder(), decoder.to_file()).unwrap();
+        let files = ["--record", "episodes.mcap", "--gif", "film.gif"];
+        let arguments = [&["--run", ".", "--episodes", "1"], &files[..]].concat();
+        let output = evaluate(at, &arguments);
+        assert!(output.status.success(), "{output:?}");
+        assert!(at.join("film.gif").exists());
+        let recording = std::fs::read(at.join("episodes.mcap")).unwrap();
+        let messages = mcap::MessageStream::new(&recording).unwrap();
+        let topics = messages.map(|message| message.unwrap().channel.topic.clone());
+        let topics: Vec<_> = topics.collect();
+        ["/camera/reconstruction", "/camera/image"]
+            .map(|topic| topics.iter().filter(|other| *other == topic).count())
+    };
+    assert_eq!(reconstructions(&decoder)[0], 0, "of another encoder");
+    decoder.encoder_sha256 = encoder.sha256();
+    let [reconstructed, seen] = reconstructions(&decoder);
+    assert!(
+        seen > 0 && reconstructed == seen,
+        "{reconstructed} of {seen}"
+    );
+    std::fs::write(run.decoder(), "no decoder").unwrap();
+    let error = error_of(at, &["--run", ".", "--gif", "film.gif"]);
+    for part in ["decoder.safetensors", "remove it"] {
+        assert!(error.contains(part), "{error}");
+    }
 }
 
 #[test]

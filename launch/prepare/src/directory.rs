@@ -7,7 +7,10 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use skein_protocol::config::ParameterKey;
 use skein_protocol::config::{Config, CoursesSection};
+use skein_protocol::decoder_file::{DECODER_FILE, TrainedDecoder};
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_run::RunDirectory;
 use skein_simulator::course::Course;
 
@@ -93,6 +96,9 @@ pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), Prepar
     let run = RunDirectory::new(root);
     for (key, path) in config.parameter_files_mut() {
         copy(path, run.parameters(key))?;
+        if key == ParameterKey::Encoder {
+            copy_decoder(path, run.decoder())?;
+        }
         *path = key.copy().into();
     }
     let folder = run.courses();
@@ -112,6 +118,19 @@ pub(super) fn copy_inputs(root: &Path, config: &mut Config) -> Result<(), Prepar
         copies.insert(name, std::mem::replace(path, relative));
     }
     Ok(())
+}
+
+/// Copies the decoder that lies beside the file of an encoder, if it belongs to that.
+fn copy_decoder(encoder: &Path, to: PathBuf) -> Result<(), PrepareError> {
+    let decoder = encoder.with_file_name(DECODER_FILE);
+    let belongs = || {
+        let encoder = TrainedEncoder::load(encoder)?;
+        TrainedDecoder::of(&encoder.sha256(), &decoder)
+    };
+    match belongs().map_err(|source| PrepareError::Decoder { source })? {
+        Some(_) => copy(&decoder, to),
+        None => Ok(()),
+    }
 }
 
 /// Copies the mesh files that the course file `path` names.

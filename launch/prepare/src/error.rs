@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use skein_protocol::config::ConfigError;
 use skein_protocol::encoder_file::EncoderError;
 use skein_protocol::policy_file::PolicyError;
+use skein_protocol::snapshot::SnapshotError;
 use skein_run::RunError;
 use skein_run::terminal::quoted;
 use skein_simulator::course::{CourseError, RangesError};
@@ -30,6 +31,12 @@ pub enum PrepareError {
     /// A course cannot be flown.
     #[error(transparent)]
     Course(#[from] CourseError),
+    /// The decoder beside an encoder cannot be read.
+    #[error("{source}; remove it: it only shows what latent codes hold")]
+    Decoder {
+        /// Path and problem.
+        source: SnapshotError,
+    },
     /// A mesh file that a run cannot keep a copy of under its name.
     #[error(
         "{}: file = {file:?}: a run keeps copies of all mesh files in one folder: put the file \

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use skein_protocol::config::ParameterKey;
+use skein_protocol::decoder_file::{DECODER_FILE, TrainedDecoder};
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::snapshot::SnapshotLayout;
 use skein_simulator::course::Course;
@@ -86,6 +87,45 @@ fn a_run_keeps_the_encoder_that_it_starts_from() {
     assert_eq!(TrainedEncoder::of(&config).unwrap(), Some(trained));
     let copy = fs::metadata(prepared.run.parameters(ParameterKey::Encoder)).unwrap();
     assert_eq!(copy.permissions().mode() & 0o777, 0o600);
+    assert!(!prepared.run.decoder().exists(), "none was beside it");
+}
+
+#[test]
+fn a_run_keeps_the_decoder_of_the_encoder_that_it_starts_from() {
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let text = "[vae]\ntrain_steps = 0\nstart_from = \"mine.safetensors\"";
+    let config = config_file(directory.path(), text);
+    let latent = Config::default().vae.latent;
+    let encoder = TrainedEncoder {
+        values: vec![0.25; SnapshotLayout::of(&Config::default()).encoder().len()],
+        latent,
+    };
+    fs::write(
+        at("mine.safetensors"),
+        encoder.to_file(&Config::default(), 9),
+    )
+    .unwrap();
+    let start = |run: &str| prepare(&config, &[], &at(run), 2);
+    let numbers = TrainedDecoder::tensors(latent).last().unwrap().range.end;
+    for (run, encoder_sha256, is_kept) in [
+        ("own", encoder.sha256(), true),
+        ("foreign", "another encoder's".to_owned(), false),
+    ] {
+        let values = vec![0.5; numbers];
+        let decoder = TrainedDecoder {
+            values,
+            latent,
+            encoder_sha256,
+        };
+        fs::write(at(DECODER_FILE), decoder.to_file()).unwrap();
+        assert_eq!(start(run).unwrap().run.decoder().exists(), is_kept, "{run}");
+    }
+    fs::write(at(DECODER_FILE), "no tensors").unwrap();
+    let error = start("damaged").unwrap_err().to_string();
+    for part in [DECODER_FILE, "remove it"] {
+        assert!(error.contains(part), "{error}");
+    }
 }
 
 #[test]

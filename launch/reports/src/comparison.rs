@@ -37,7 +37,7 @@ pub struct Comparison<'a> {
     /// Title above the picture.
     pub title: String,
     /// Label of the x axis.
-    pub x: &'static str,
+    pub x: &'a str,
     /// Label of the y axis.
     pub y: &'static str,
     /// Reference level and its label.

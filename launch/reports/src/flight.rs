@@ -1,5 +1,6 @@
 //! Moving picture of an episode: the drone in its corridor from above and from the side, what its
-//! camera sees, and the latent code that the policy sees instead.
+//! camera sees, and what the policy sees instead: the latent code, or the image that the decoder
+//! makes of it.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -23,8 +24,8 @@ const LABEL: u32 = 20;
 const HIGHEST: f32 = 120.0;
 const ZOOM: u32 = 2;
 const IMAGE: (u32, u32) = (IMAGE_WIDTH as u32 * ZOOM, IMAGE_HEIGHT as u32 * ZOOM);
-/// Left edge of the latent code's bars.
-const BARS: u32 = LEFT + IMAGE.0 + 30;
+/// Left edge of the latent code.
+const CODE: u32 = LEFT + IMAGE.0 + 30;
 /// Standard deviations of the code that a bar of full length shows.
 const LONGEST_BAR: f32 = 3.0;
 /// Time of a picture, hundredths of a second: five times as fast as flown, at the usual period.
@@ -34,6 +35,24 @@ const LAST_DELAY: u16 = 150;
 /// Height of the drone's body, metres. Source: as for [`DRONE_WIDTH_M`].
 const DRONE_HEIGHT_M: f32 = 0.29;
 
+/// A latent code, to be shown.
+#[derive(Debug, Clone, Copy)]
+pub enum CodeView<'a> {
+    /// Its numbers, drawn as bars.
+    Numbers(&'a [f32]),
+    /// The depth image that the decoder makes of it.
+    Image(&'a [u8]),
+}
+
+impl CodeView<'_> {
+    fn label(self) -> &'static str {
+        match self {
+            Self::Numbers(_) => "what the policy sees of it: the latent code",
+            Self::Image(_) => "what the latent code keeps of it",
+        }
+    }
+}
+
 /// An observation of an episode.
 #[derive(Debug, Clone, Copy)]
 pub struct FlightStep<'a> {
@@ -41,8 +60,8 @@ pub struct FlightStep<'a> {
     pub position_m: [f32; 3],
     /// Depth image.
     pub depth: &'a [u8],
-    /// Its latent code.
-    pub latent: &'a [f32],
+    /// The latent code, which the policy sees instead.
+    pub code: CodeView<'a>,
     /// Walls passed so far.
     pub walls_passed: u8,
 }
@@ -58,7 +77,10 @@ pub fn draw_flight(
     path: &Path,
 ) -> Result<(), ReportError> {
     let stage = Stage::of(course);
-    let empty = stage.empty()?;
+    let Some(first) = steps.first() else {
+        return Ok(());
+    };
+    let empty = stage.empty(first.code)?;
     let mut film = Film::new(WIDTH, stage.height);
     for number in 0..steps.len() {
         let mut canvas = empty.clone();
@@ -132,7 +154,7 @@ impl<'a> Stage<'a> {
     }
 
     /// Returns the picture without a drone.
-    fn empty(&self) -> Result<Canvas, ReportError> {
+    fn empty(&self, code: CodeView<'_>) -> Result<Canvas, ReportError> {
         let mut canvas = Canvas::new(WIDTH, self.height);
         canvas.draw(|area| {
             let labels = [
@@ -143,11 +165,7 @@ impl<'a> Stage<'a> {
                     LEFT,
                     self.image,
                 ),
-                (
-                    "what the policy sees of it: the latent code",
-                    BARS,
-                    self.image,
-                ),
+                (code.label(), CODE, self.image),
             ];
             for (label, x, y) in labels {
                 area.draw_text(label, &font(13), drawn(x, y - LABEL + 2))?;
@@ -219,9 +237,15 @@ impl<'a> Stage<'a> {
                 area.draw(&PathElement::new(way, STRONG.stroke_width(px(1))))?;
                 self.draw_drone(area, axis, now.position_m)?;
             }
-            self.draw_code(area, now.latent)
+            match now.code {
+                CodeView::Numbers(latent) => self.draw_code(area, latent),
+                CodeView::Image(_) => Ok(()),
+            }
         })?;
         canvas.put_grey(now.depth, IMAGE_WIDTH, (LEFT, self.image), ZOOM);
+        if let CodeView::Image(image) = now.code {
+            canvas.put_grey(image, IMAGE_WIDTH, (CODE, self.image), ZOOM);
+        }
         Ok(())
     }
 
@@ -247,10 +271,10 @@ impl<'a> Stage<'a> {
 
     /// Draws a bar for each number of the code, up or down from the middle.
     fn draw_code(&self, area: &Area<'_>, latent: &[f32]) -> Result<(), Box<dyn std::error::Error>> {
-        let room = px(WIDTH - LEFT - BARS) as f32;
+        let room = px(WIDTH - LEFT - CODE) as f32;
         let step = room / latent.len().max(1) as f32;
         let half = px(IMAGE.1) as f32 / 2.0;
-        let (left, middle) = (px(BARS) as f32, px(self.image) as f32 + half);
+        let (left, middle) = (px(CODE) as f32, px(self.image) as f32 + half);
         for (number, value) in latent.iter().enumerate() {
             let x = left + number as f32 * step;
             let length = (value / LONGEST_BAR).clamp(-1.0, 1.0) * half;
@@ -393,7 +417,7 @@ mod tests {
         let step = |x_m: f32, depth| FlightStep {
             position_m: [x_m, 0.0, 3.5],
             depth,
-            latent: &[1.0, -2.0, 0.5],
+            code: CodeView::Numbers(&[1.0, -2.0, 0.5]),
             walls_passed: 0,
         };
         let steps = [step(2.0, &first), step(6.0, &second)];

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use clap::Parser;
+use skein_protocol::decoder_file::DECODER_FILE;
 
 /// Trains an encoder on depth images from random poses in generated courses, before any run.
 ///
@@ -18,8 +19,13 @@ pub struct Arguments {
     #[arg(long, value_name = "FILE", overrides_with = "config")]
     pub config: PathBuf,
     /// Where the encoder goes. Its loss, reconstructions and checkpoint go beside it.
-    #[arg(long, value_name = "FILE", required_unless_present = "measure")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["measure", "decoder_of"])]
     pub output: Option<PathBuf>,
+    /// Train the decoder alone, decoder.safetensors beside this FILE, for the codes of the encoder
+    /// in it, or of a snapshot's. Recordings, moving pictures and the page show with it what codes
+    /// hold. --set encoder.steps=2000 is enough.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["output", "measure"])]
+    pub decoder_of: Option<PathBuf>,
     /// Train nothing: measure the encoder in this file, or that of a snapshot.
     #[arg(long, value_name = "FILE", conflicts_with = "output")]
     pub measure: Option<PathBuf>,
@@ -44,6 +50,8 @@ Exit status: 0 finished, 1 failed, 2 wrong arguments, 130 interrupted.";
 pub struct EncoderFiles {
     /// The encoder.
     pub encoder: PathBuf,
+    /// Its decoder, which shows what latent codes hold.
+    pub decoder: PathBuf,
     /// State from which the training resumes; removed at its end.
     pub checkpoint: PathBuf,
     /// Loss and its parts over the steps.
@@ -52,6 +60,22 @@ pub struct EncoderFiles {
     pub curve_picture: PathBuf,
     /// Depth images beside their reconstructions.
     pub reconstructions: PathBuf,
+}
+
+impl EncoderFiles {
+    /// Returns the files of a training that belong to the file `encoder`; the names of those that
+    /// describe it begin with `stem`.
+    pub(crate) fn beside(encoder: &Path, stem: &str) -> Self {
+        let beside = |end: &str| encoder.with_file_name(format!("{stem}{end}"));
+        Self {
+            encoder: encoder.to_owned(),
+            decoder: encoder.with_file_name(DECODER_FILE),
+            checkpoint: beside(".checkpoint"),
+            curve: beside("_loss.csv"),
+            curve_picture: beside("_loss.png"),
+            reconstructions: beside("_reconstructions.png"),
+        }
+    }
 }
 
 /// Sections and keys that count for a training alone.
@@ -105,6 +129,9 @@ impl Arguments {
     /// # Errors
     /// If the output has no name, or lies in a folder that does not exist.
     pub fn files(&self) -> Result<EncoderFiles> {
+        if let Some(encoder) = &self.decoder_of {
+            return Ok(EncoderFiles::beside(encoder, "decoder"));
+        }
         let output = self.output.as_deref().unwrap_or(Path::new(""));
         let stem = output.file_stem().and_then(|stem| stem.to_str());
         let stem = stem.context("--output names no file, or one that is not UTF-8")?;
@@ -114,20 +141,13 @@ impl Arguments {
             "--output {}: its folder does not exist: create it",
             output.display()
         );
-        let beside = |end: &str| output.with_file_name(format!("{stem}{end}"));
-        let checkpoint = beside(".checkpoint");
+        let files = EncoderFiles::beside(output, stem);
         anyhow::ensure!(
-            output != checkpoint,
+            output != files.checkpoint,
             "--output {}: the training keeps its state there and removes it: name another file",
             output.display()
         );
-        Ok(EncoderFiles {
-            encoder: output.to_owned(),
-            checkpoint,
-            curve: beside("_loss.csv"),
-            curve_picture: beside("_loss.png"),
-            reconstructions: beside("_reconstructions.png"),
-        })
+        Ok(files)
     }
 }
 

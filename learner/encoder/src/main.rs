@@ -47,15 +47,20 @@ fn run(arguments: &Arguments) -> Result<ExitCode> {
     let stop = end_on_signal().context("cannot listen to signals")?;
     // Signals end the process at once while the flag is set: then there is nothing to save.
     stop.store(true, Ordering::Relaxed);
-    let mut training = Training::begin(&config, &settings, arguments.files()?)?;
+    let frozen = arguments.decoder_of.as_deref().map(TrainedEncoder::load);
+    let (frozen, files) = (frozen.transpose()?, arguments.files()?);
+    let mut training = Training::begin(&config, &settings, files.clone(), frozen)?;
     stop.store(false, Ordering::Relaxed);
     let ending = training.train(&stop)?;
     stop.store(true, Ordering::Relaxed);
     match ending {
         Ending::Completed => {
-            let (encoder, file) = training.finish()?;
-            show!("{}", Measurement::of(&encoder, &config, &settings)?);
-            show!("{}: SHA-256 {}", file.display(), encoder.sha256());
+            let encoder = training.finish()?;
+            if arguments.decoder_of.is_none() {
+                show!("{}", Measurement::of(&encoder, &config, &settings)?);
+                let file = files.encoder.display();
+                show!("{file}: SHA-256 {}", encoder.sha256());
+            }
             Ok(ExitCode::SUCCESS)
         }
         Ending::Interrupted(steps) => {

@@ -1,7 +1,7 @@
 //! The training loop: draw views, make a step, and now and then save all that a step changes.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result, ensure};
@@ -10,6 +10,7 @@ use skein_learner::state::Stateful;
 use skein_learner::vae::{NativeVae, Targets};
 use skein_protocol::IMAGE_PIXELS;
 use skein_protocol::config::{Config, Engine};
+use skein_protocol::decoder_file::TrainedDecoder;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::seeds::{Purpose, derive};
 use skein_run::failure::with_causes;
@@ -33,6 +34,8 @@ pub struct Training<'a> {
     settings: &'a SimulatorSettings,
     files: EncoderFiles,
     vae: NativeVae,
+    /// The encoder that is there already: only its decoder is trained.
+    frozen: Option<TrainedEncoder>,
     curve: Vec<CurvePoint>,
 }
 
@@ -46,7 +49,8 @@ pub enum Ending {
 }
 
 impl<'a> Training<'a> {
-    /// Starts a training, or resumes it from its checkpoint.
+    /// Starts a training, or resumes it from its checkpoint. With a `frozen` encoder, only its
+    /// decoder is trained.
     ///
     /// # Errors
     /// Names the key or file at fault, and the remedy.
@@ -54,19 +58,24 @@ impl<'a> Training<'a> {
         config: &'a Config,
         settings: &'a SimulatorSettings,
         files: EncoderFiles,
+        frozen: Option<TrainedEncoder>,
     ) -> Result<Self> {
         ensure!(
             config.vae.engine(&config.run) == Engine::Native,
             "an encoder is trained with the native engine alone: leave run.engine, run.device and \
              vae.decoder out"
         );
-        ensure!(
-            !files.encoder.exists(),
-            "{} is there already: remove it, or give another --output",
-            files.encoder.display()
-        );
+        for file in [&files.encoder, &files.decoder] {
+            let is_given = frozen.is_some() && file == &files.encoder;
+            ensure!(
+                is_given || !file.exists(),
+                "{} is there already: remove it, or give another --output",
+                file.display()
+            );
+        }
         let mut training = Self {
-            vae: new_vae(config),
+            vae: new_vae(config, frozen.as_ref())?,
+            frozen,
             config,
             settings,
             files,
@@ -74,6 +83,13 @@ impl<'a> Training<'a> {
         };
         if let Some(saved) = Checkpoint::load(&training.files.checkpoint, config)? {
             training.vae.load_named(&saved.tensors)?;
+            if let Some(encoder) = &training.frozen {
+                ensure!(
+                    training.encoder() == *encoder,
+                    "{} belongs to another encoder: remove it",
+                    training.files.checkpoint.display()
+                );
+            }
             training.curve = saved.curve;
             note!(
                 "skein encoder: resuming after step {}",
@@ -143,9 +159,15 @@ impl<'a> Training<'a> {
         let views = Views::draw(self.settings, which, config.vae.batch_size)?;
         let mut noise = Noise::new(derive(seed, Purpose::EncoderNoise, step));
         self.vae.set_learning_rate(learning_rate(config, step));
-        let targets = Targets {
-            clean: Some(&views.clean[..reproduced(config) * IMAGE_PIXELS]),
-            geometry: &views.known,
+        let targets = match self.frozen {
+            None => Targets {
+                clean: Some(&views.clean[..reproduced(config) * IMAGE_PIXELS]),
+                geometry: &views.known,
+            },
+            Some(_) => Targets {
+                clean: Some(&views.clean),
+                geometry: &[],
+            },
         };
         let updated = self
             .vae
@@ -169,24 +191,39 @@ impl<'a> Training<'a> {
         checkpoint.save(&self.files.checkpoint, self.config)
     }
 
-    /// Writes the encoder and what shows how it was trained; removes the checkpoint. Returns the
-    /// encoder and its file. Tables and pictures that cannot be written are named and left out.
-    ///
-    /// # Errors
-    /// Names the encoder's file if it cannot be written, or the checkpoint.
-    pub fn finish(mut self) -> Result<(TrainedEncoder, PathBuf)> {
+    /// Returns the encoder as it is now.
+    fn encoder(&self) -> TrainedEncoder {
         let mut values = vec![0.0; self.vae.published_len()];
         self.vae.publish(&mut values);
-        let encoder = TrainedEncoder {
+        TrainedEncoder {
             values,
             latent: self.config.vae.latent,
+        }
+    }
+
+    /// Writes what was trained, encoder and decoder, and what shows how; removes the checkpoint.
+    /// Returns the encoder. Tables and pictures that cannot be written are named and left out.
+    ///
+    /// # Errors
+    /// Names the file that cannot be written, or the checkpoint.
+    pub fn finish(mut self) -> Result<TrainedEncoder> {
+        let encoder = self.encoder();
+        let decoder = TrainedDecoder {
+            values: self.vae.decoder_values(),
+            latent: encoder.latent,
+            encoder_sha256: encoder.sha256(),
         };
-        let path = self.files.encoder.clone();
-        durable::replace(&path, &encoder.to_file(self.config, self.vae.updates()))
-            .with_context(|| path.display().to_string())?;
+        let write = |path: &Path, bytes: &[u8]| {
+            durable::replace(path, bytes).with_context(|| path.display().to_string())
+        };
+        write(&self.files.decoder, &decoder.to_file())?;
+        if self.frozen.is_none() {
+            let file = encoder.to_file(self.config, self.vae.updates());
+            write(&self.files.encoder, &file)?;
+        }
         if let Err(error) = self.describe() {
             note!(
-                "skein encoder: the encoder is written; left out: {}",
+                "skein encoder: the networks are written; left out: {}",
                 with_causes(error.as_ref())
             );
         }
@@ -194,7 +231,7 @@ impl<'a> Training<'a> {
             fs::remove_file(&self.files.checkpoint)
                 .with_context(|| self.files.checkpoint.display().to_string())?;
         }
-        Ok((encoder, path))
+        Ok(encoder)
     }
 
     /// Writes the curve as a table and a picture, and draws reconstructions.
@@ -213,10 +250,21 @@ impl<'a> Training<'a> {
     }
 }
 
-fn new_vae(config: &Config) -> NativeVae {
+fn new_vae(config: &Config, frozen: Option<&TrainedEncoder>) -> Result<NativeVae> {
     let (run, weight) = (&config.run, config.encoder.geometry_weight);
-    let head = (KNOWN, weight);
-    NativeVae::supervised(&config.vae, run.seed, run.learner_threads, head)
+    let Some(encoder) = frozen else {
+        let head = (KNOWN, weight);
+        let vae = NativeVae::supervised(&config.vae, run.seed, run.learner_threads, head);
+        return Ok(vae);
+    };
+    ensure!(
+        encoder.latent == config.vae.latent,
+        "the encoder's codes have {0} numbers: --set vae.latent={0}",
+        encoder.latent
+    );
+    let mut vae = NativeVae::new(&config.vae, run.seed, run.learner_threads);
+    vae.freeze_encoder(&encoder.values);
+    Ok(vae)
 }
 
 /// Returns the number of images of a minibatch that the decoder reproduces, at least one.
@@ -234,6 +282,8 @@ fn learning_rate(config: &Config, step: u64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use super::*;
 
     fn config() -> Config {
@@ -249,6 +299,7 @@ mod tests {
             config: PathBuf::new(),
             output: Some(folder.join("mine.safetensors")),
             measure: None,
+            decoder_of: None,
             overrides: Vec::new(),
         };
         arguments.files().unwrap()
@@ -258,14 +309,18 @@ mod tests {
     fn a_training_that_was_stopped_or_killed_ends_with_the_same_bits() {
         let (config, settings) = (config(), SimulatorSettings::default());
         let folder = tempfile::tempdir().unwrap();
-        let begin = || Training::begin(&config, &settings, files(folder.path())).unwrap();
+        let begin = || Training::begin(&config, &settings, files(folder.path()), None).unwrap();
         let go = AtomicBool::new(false);
         let mut undisturbed = begin();
         assert_eq!(undisturbed.train(&go).unwrap(), Ending::Completed);
-        let (expected, file) = undisturbed.finish().unwrap();
+        let expected = undisturbed.finish().unwrap();
+        let file = files(folder.path()).encoder;
         assert_eq!(TrainedEncoder::load(&file).unwrap(), expected);
         let curve = fs::read(files(folder.path()).curve).unwrap();
+        let decoder = TrainedDecoder::of(&expected.sha256(), &files(folder.path()).decoder);
+        assert!(decoder.unwrap().is_some());
         fs::remove_file(&file).unwrap();
+        fs::remove_file(files(folder.path()).decoder).unwrap();
 
         let mut stopped = begin();
         let ending = stopped.train(&AtomicBool::new(true)).unwrap();
@@ -277,7 +332,7 @@ mod tests {
         let mut resumed = begin();
         assert_eq!(resumed.vae.updates(), STEPS_PER_POINT);
         resumed.train(&go).unwrap();
-        assert_eq!(resumed.finish().unwrap().0, expected);
+        assert_eq!(resumed.finish().unwrap(), expected);
         assert_eq!(fs::read(files(folder.path()).curve).unwrap(), curve);
         let mut left: Vec<_> = fs::read_dir(folder.path())
             .unwrap()
@@ -285,13 +340,14 @@ mod tests {
             .collect();
         left.sort();
         let expected = [
+            "decoder.safetensors",
             "mine.safetensors",
             "mine_loss.csv",
             "mine_loss.png",
             "mine_reconstructions.png",
         ];
         assert_eq!(left, expected, "and no checkpoint");
-        let again = Training::begin(&config, &settings, files(folder.path()));
+        let again = Training::begin(&config, &settings, files(folder.path()), None);
         let error = again.err().unwrap().to_string();
         assert!(
             error.contains("mine.safetensors") && error.contains("--output"),
@@ -306,12 +362,58 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let files = files(folder.path());
         fs::create_dir(&files.reconstructions).unwrap();
-        let mut training = Training::begin(&config, &settings, files.clone()).unwrap();
+        let mut training = Training::begin(&config, &settings, files.clone(), None).unwrap();
         assert!(files.checkpoint.exists(), "before the first step");
         training.train(&AtomicBool::new(false)).unwrap();
-        let (encoder, file) = training.finish().unwrap();
-        assert_eq!(TrainedEncoder::load(&file).unwrap(), encoder);
+        let encoder = training.finish().unwrap();
+        assert_eq!(TrainedEncoder::load(&files.encoder).unwrap(), encoder);
         assert!(files.curve.exists() && !files.checkpoint.exists());
+    }
+
+    #[test]
+    fn a_decoder_is_trained_for_an_encoder_that_stays_as_it_is() {
+        let (mut config, settings) = (config(), SimulatorSettings::default());
+        config.encoder.steps = STEPS_PER_POINT;
+        let folder = tempfile::tempdir().unwrap();
+        let given = new_vae(&config, None).unwrap();
+        let mut values = vec![0.0; given.published_len()];
+        given.publish(&mut values);
+        let encoder = TrainedEncoder { values, latent: 8 };
+        let files = EncoderFiles::beside(&folder.path().join("given.safetensors"), "decoder");
+        fs::write(&files.encoder, "as it is").unwrap();
+        let begin = |encoder: &TrainedEncoder| {
+            Training::begin(&config, &settings, files.clone(), Some(encoder.clone()))
+        };
+        let mut training = begin(&encoder).unwrap();
+        training.train(&AtomicBool::new(false)).unwrap();
+        training.save().unwrap();
+        let mut other = encoder.clone();
+        other.values[0] += 1.0;
+        let refused = begin(&other).err().unwrap().to_string();
+        assert!(refused.contains("another encoder"), "{refused}");
+
+        let (first, last) = (
+            training.curve[0][2],
+            new_error(&config, &settings, &encoder),
+        );
+        assert!(first < last, "the decoder has learned: {first} {last}");
+        assert_eq!(training.finish().unwrap(), encoder);
+        assert_eq!(fs::read(&files.encoder).unwrap(), b"as it is");
+        let decoder = TrainedDecoder::of(&encoder.sha256(), &files.decoder);
+        assert!(decoder.unwrap().is_some());
+        assert!(!files.checkpoint.exists());
+
+        config.vae.latent = 16;
+        let refused = new_vae(&config, Some(&encoder)).err().unwrap().to_string();
+        assert!(refused.contains("--set vae.latent=8"), "{refused}");
+    }
+
+    /// Returns the squared error of an untrained decoder's first step.
+    fn new_error(config: &Config, settings: &SimulatorSettings, encoder: &TrainedEncoder) -> f64 {
+        let folder = tempfile::tempdir().unwrap();
+        let files = EncoderFiles::beside(&folder.path().join("e"), "decoder");
+        let training = Training::begin(config, settings, files, Some(encoder.clone()));
+        training.unwrap().step(0).unwrap()[2]
     }
 
     #[test]

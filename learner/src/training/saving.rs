@@ -15,7 +15,7 @@ use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::summary::{RunEnding, RunSummary};
 use skein_run::fault::{FaultPoint, die_if_armed};
-use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, save_snapshot};
+use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, durable, save_snapshot};
 
 use super::{EpochCurves, StopMonitor, Training, TrainingError};
 use crate::checkpoint::{
@@ -108,6 +108,7 @@ impl<'a> Training<'a> {
             timer,
             progress: saved.clone(),
             saved,
+            decoder_saved: None,
             saved_snapshots: snapshots.clone(),
             resumes,
             in_flight: VecDeque::new(),
@@ -211,6 +212,7 @@ impl<'a> Training<'a> {
         self.timer.lap(Stage::OtherTraining, 0);
         self.metrics.flush()?;
         self.save_snapshot(self.progress.version(), &self.directory.latest_snapshot())?;
+        self.save_decoder()?;
         self.timer.lap(Stage::Checkpoint, 0);
         let progress = self.full_progress();
         let snapshots = self.snapshots.clone();
@@ -223,6 +225,21 @@ impl<'a> Training<'a> {
         self.checkpoints.save(state, self.metrics.files())?;
         (self.saved, self.saved_snapshots) = (progress, snapshots);
         self.timer.lap(Stage::Checkpoint, 1);
+        Ok(())
+    }
+
+    /// Writes the VAE's decoder to its file, if the VAE has learned since the last one.
+    fn save_decoder(&mut self) -> Result<(), TrainingError> {
+        let updates = self.trainer.vae_updates();
+        if self.decoder_saved != Some(updates)
+            && let Some(decoder) = self.trainer.decoder()
+        {
+            let path = self.directory.decoder();
+            self.disk
+                .with_room(&path, || durable::replace(&path, &decoder.to_file()))
+                .map_err(file_error(&path))?;
+        }
+        self.decoder_saved = Some(updates);
         Ok(())
     }
 

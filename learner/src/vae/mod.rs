@@ -101,6 +101,16 @@ impl Vae {
         }
     }
 
+    /// Returns the decoder's parameters, the tensors of a
+    /// [`TrainedDecoder`](skein_protocol::decoder_file::TrainedDecoder); `None` if it needs more
+    /// than the code.
+    pub fn decoder_values(&self) -> Option<Vec<f32>> {
+        match self {
+            Self::Native(vae) => Some(vae.decoder_values()),
+            Self::Libtorch(vae) => vae.decoder_values(),
+        }
+    }
+
     /// Number of VAE steps done so far.
     pub fn updates(&self) -> u64 {
         match self {

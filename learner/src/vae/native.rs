@@ -53,6 +53,10 @@ pub struct NativeVae {
     order: ParameterOrder,
     /// Length of the prefix of PyTorch's order that actors need.
     published_len: usize,
+    /// Where the decoder begins, in PyTorch's order and in the native one.
+    decoder_start: usize,
+    /// Number of leading parameters that steps leave as they are.
+    frozen: usize,
     network: VaeNetwork,
     /// `true` if `network` has packed the present parameters.
     packed: bool,
@@ -113,6 +117,7 @@ impl NativeVae {
         let mut layout = Layout::default();
         let published_len = EncoderNetwork::describe(&mut layout, section.latent).published_len();
         layout.widen_weights(wider);
+        let decoder_start = layout.len();
         let _ = DecoderNetwork::describe(&mut layout, section.latent, DecoderName::Plain);
         let order = ParameterOrder::of(&layout);
         let initial = layout.initial_values(derive(run_seed, Purpose::VaeParameters, 0));
@@ -123,6 +128,8 @@ impl NativeVae {
             members: (0..team.size()).map(|_| MemberScratch::new(isa)).collect(),
             team,
             published_len,
+            decoder_start,
+            frozen: 0,
             network: VaeNetwork::new(isa, section.latent, &order),
             packed: false,
             parameters: Buffer::zeroed(len),
@@ -139,6 +146,28 @@ impl NativeVae {
         vae.parameters
             .copy_from_slice(&vae.order.arrange_from_pytorch(&initial));
         vae
+    }
+
+    /// Takes over an encoder, [`NativeVae::publish`]'s values. From now on steps train the decoder
+    /// alone, on the codes' means.
+    ///
+    /// # Panics
+    /// When there are not [`NativeVae::published_len`] values.
+    pub fn freeze_encoder(&mut self, encoder: &[f32]) {
+        /// Logarithm of a variance that moves no code.
+        const SURE: f32 = -20.0;
+        let mut values = vec![0.0; self.parameters.len()];
+        self.order.to_pytorch(&self.parameters, &mut values);
+        let (published, rest) = values.split_at_mut(self.published_len);
+        published.copy_from_slice(encoder);
+        let log_variance = &mut rest[..self.decoder_start - self.published_len];
+        let (weights, biases) =
+            log_variance.split_at_mut(log_variance.len() - self.network.latent());
+        weights.fill(0.0);
+        biases.fill(SURE);
+        let arranged = self.order.arrange_from_pytorch(&values);
+        self.parameters.copy_from_slice(&arranged);
+        (self.frozen, self.packed) = (self.decoder_start, false);
     }
 
     /// Sets Adam's step size from the next step on.
@@ -263,7 +292,7 @@ impl NativeVae {
         let watch = &mut self.members[0].watch;
         watch.start();
         let blocks = self.network.unfold.place.weight.clone();
-        for part in [0..blocks.start, blocks.end..self.parameters.len()] {
+        for part in [self.frozen..blocks.start, blocks.end..self.parameters.len()] {
             let moments = [&mut first[part.clone()], &mut second[part.clone()]];
             let (parameters, gradient) = (&mut self.parameters[part.clone()], &self.gradient[part]);
             adam.apply(&mut self.team, isa, parameters, gradient, moments);
@@ -371,6 +400,14 @@ impl NativeVae {
             "as many places as parameters"
         );
         self.order.to_pytorch(&self.parameters, into);
+    }
+
+    /// Returns the decoder's parameters, the tensors of a
+    /// [`TrainedDecoder`](skein_protocol::decoder_file::TrainedDecoder).
+    pub fn decoder_values(&self) -> Vec<f32> {
+        let mut values = vec![0.0; self.parameters.len()];
+        self.order.to_pytorch(&self.parameters, &mut values);
+        values.split_off(self.decoder_start)
     }
 
     /// Number of VAE steps done so far.

@@ -2,7 +2,7 @@
 //!
 //! It is the reference of the native engine, and the engine for CUDA devices and U-Net decoders.
 
-use skein_protocol::config::VaeSection;
+use skein_protocol::config::{DecoderName, VaeSection};
 use skein_protocol::seeds::{Purpose, derive};
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
 use tch::{Device, Kind, Tensor, no_grad_guard};
@@ -25,6 +25,8 @@ pub struct TorchVae {
     latent: i64,
     encoder: EncoderNetwork,
     decoder: DecoderNetwork,
+    /// Where the decoder begins in the parameters; `None` for one that needs more than the code.
+    plain_decoder: Option<usize>,
     /// Parameters: the part that actors need, then the log-variance head, then the decoder.
     parameters: Parameters,
     optimizer: Adam,
@@ -43,6 +45,7 @@ impl TorchVae {
     pub fn new(section: &VaeSection, run_seed: u64, device: Device) -> Self {
         let mut layout = Layout::default();
         let encoder = EncoderNetwork::describe(&mut layout, section.latent);
+        let plain_decoder = (section.decoder == DecoderName::Plain).then(|| layout.len());
         let decoder = DecoderNetwork::describe(&mut layout, section.latent, section.decoder);
         let parameters =
             Parameters::initialise(layout, derive(run_seed, Purpose::VaeParameters, 0), device);
@@ -51,6 +54,7 @@ impl TorchVae {
             latent: section.latent as i64,
             encoder,
             decoder,
+            plain_decoder,
             parameters,
             optimizer,
             kl_weight: section.kl_weight,
@@ -148,6 +152,16 @@ impl TorchVae {
     /// When `into` is not [`TorchVae::published_len`] long.
     pub fn publish(&self, into: &mut [f32]) {
         self.parameters.copy_range(0..self.published_len(), into);
+    }
+
+    /// Returns the decoder's parameters, the tensors of a
+    /// [`TrainedDecoder`](skein_protocol::decoder_file::TrainedDecoder); `None` if it needs more
+    /// than the code.
+    pub fn decoder_values(&self) -> Option<Vec<f32>> {
+        let range = self.plain_decoder?..self.parameters.flat().numel();
+        let mut values = vec![0.0; range.len()];
+        self.parameters.copy_range(range, &mut values);
+        Some(values)
     }
 
     /// Number of VAE steps done so far.

@@ -5,16 +5,12 @@
 //! needs it. Images lie channels-last, as in the encoder.
 
 use skein_kernels::{Finish, Isa, Matrix, Panels, Windows, spread};
-use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
+use skein_protocol::IMAGE_PIXELS;
+use skein_protocol::decoder_file::{DECODER_KERNELS, DECODER_MAPS, TrainedDecoder};
 
 use crate::linear::Linear;
 
 const STRIDE: usize = 2;
-/// Pixels of the first feature map, in one row.
-const UNFOLDED: usize = 3;
-/// Channels of the feature maps; the last one is the depth image.
-const CHANNELS: [usize; 5] = [1024, 128, 64, 32, 1];
-const KERNELS: [[usize; 2]; 4] = [[5, 7], [6, 8], [7, 8], [8, 6]];
 
 /// Parameters of the decoder, arranged for [`Decoder::decode`].
 #[derive(Debug)]
@@ -24,53 +20,34 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// Names and lengths of the tensors of a decoder of codes of `latent` numbers, in PyTorch's
-    /// order of the parameters.
-    pub fn tensors(latent: usize) -> [(&'static str, usize); 10] {
-        let weights = |layer: usize| {
-            let [height, width] = KERNELS[layer];
-            CHANNELS[layer] * CHANNELS[layer + 1] * height * width
-        };
-        [
-            ("decoder.linear.weight", CHANNELS[0] * UNFOLDED * latent),
-            ("decoder.linear.bias", CHANNELS[0] * UNFOLDED),
-            ("decoder.conv1.weight", weights(0)),
-            ("decoder.conv1.bias", CHANNELS[1]),
-            ("decoder.conv2.weight", weights(1)),
-            ("decoder.conv2.bias", CHANNELS[2]),
-            ("decoder.conv3.weight", weights(2)),
-            ("decoder.conv3.bias", CHANNELS[3]),
-            ("decoder.conv4.weight", weights(3)),
-            ("decoder.conv4.bias", CHANNELS[4]),
-        ]
-    }
-
-    /// `tensor` returns a parameter by its name in [`Decoder::tensors`]. Weights of convolutions
-    /// are `[inputs, kernel height, kernel width, outputs]`; the linear layer's outputs are
-    /// `[3, 1024]`.
+    /// Arranges the parameters of a trained decoder.
     ///
     /// # Panics
-    /// If a tensor does not have the length of its shape.
-    pub fn new<'a>(isa: Isa, tensor: impl Fn(&str) -> &'a [f32]) -> Self {
-        let mut size = [1, UNFOLDED];
+    /// If it has not the number of values that its tensors hold.
+    pub fn new(isa: Isa, trained: &TrainedDecoder) -> Self {
+        let tensors = TrainedDecoder::tensors(trained.latent);
+        let values = |tensor: usize| &trained.values[tensors[tensor].range.clone()];
         let convolutions = std::array::from_fn(|layer| {
-            let kernel = KERNELS[layer];
-            size = [0, 1].map(|axis| STRIDE * (size[axis] - 1) + kernel[axis]);
-            let windows = Windows::new(size, CHANNELS[layer + 1], kernel, STRIDE);
-            let name = format!("decoder.conv{}", layer + 1);
-            let weights = tensor(&format!("{name}.weight"));
-            assert_eq!(weights.len(), CHANNELS[layer] * windows.window_len());
+            let [inputs, height, width] = DECODER_MAPS[layer];
+            let [outputs, ..] = DECODER_MAPS[layer + 1];
+            let kernel = DECODER_KERNELS[layer];
+            let size = [height, width].map(|pixels| STRIDE * (pixels - 1));
+            let size = [size[0] + kernel[0], size[1] + kernel[1]];
+            let windows = Windows::new(size, outputs, kernel, STRIDE);
+            let shape = [inputs, outputs, kernel[0] * kernel[1], 1];
+            let weights = channels_last(values(2 * layer + 2), shape);
             TransposedConvolution {
-                weights: Panels::of(isa, Matrix::of_rows(weights, windows.window_len())),
-                bias: tensor(&format!("{name}.bias")).to_vec(),
+                weights: Panels::of(isa, Matrix::of_rows(&weights, windows.window_len())),
+                bias: values(2 * layer + 3).to_vec(),
                 windows,
             }
         });
-        assert_eq!(size, [IMAGE_HEIGHT, IMAGE_WIDTH], "the depth image's size");
-        let bias = tensor("decoder.linear.bias");
-        assert_eq!(bias.len(), CHANNELS[0] * UNFOLDED);
+        let [channels, height, width] = DECODER_MAPS[0];
+        let pixels = height * width;
+        let weights = channels_last(values(0), [1, channels, pixels, trained.latent]);
+        let bias = channels_last(values(1), [1, channels, pixels, 1]);
         Self {
-            unfold: Linear::new(isa, tensor("decoder.linear.weight"), bias),
+            unfold: Linear::new(isa, &weights, &bias),
             convolutions,
         }
     }
@@ -80,7 +57,7 @@ impl Decoder {
     /// # Panics
     /// If the code has another length than the decoder's.
     pub fn decode(&self, latent: &[f32]) -> Vec<u8> {
-        let mut image = vec![0.0; CHANNELS[0] * UNFOLDED];
+        let mut image = vec![0.0; DECODER_MAPS[0].iter().product()];
         self.unfold.apply(latent, Finish::Rectified, &mut image);
         let mut scratch = Vec::new();
         for (number, convolution) in (1..).zip(&self.convolutions) {
@@ -93,6 +70,21 @@ impl Decoder {
         let byte = |logit: &f32| (255.0 / (1.0 + (-logit).exp())).round() as u8;
         image.iter().map(byte).collect()
     }
+}
+
+/// Brings `[rows, channels, pixels, len]` to `[rows, pixels, channels, len]`.
+fn channels_last(values: &[f32], [rows, channels, pixels, len]: [usize; 4]) -> Vec<f32> {
+    assert_eq!(values.len(), rows * channels * pixels * len);
+    let mut arranged = Vec::with_capacity(values.len());
+    for row in 0..rows {
+        for pixel in 0..pixels {
+            for channel in 0..channels {
+                let first = ((row * channels + channel) * pixels + pixel) * len;
+                arranged.extend_from_slice(&values[first..first + len]);
+            }
+        }
+    }
+    arranged
 }
 
 /// A transposed convolution.
@@ -122,69 +114,64 @@ mod tests {
         ((place * 7919 % 1013) as f32 / 1013.0 - 0.5) * 0.1
     }
 
-    /// Computes a transposed convolution as its definition says.
+    /// Computes a transposed convolution as PyTorch defines it. Images are `[channels, height,
+    /// width]`, `weights` `[inputs, outputs, kernel height, kernel width]`.
     fn transposed(
         input: &[f32],
-        [height, width]: [usize; 2],
-        [inputs, outputs]: [usize; 2],
+        [from, to]: [[usize; 3]; 2],
         kernel: [usize; 2],
         weights: &[f32],
         bias: &[f32],
-    ) -> (Vec<f32>, [usize; 2]) {
-        let size = [
-            STRIDE * (height - 1) + kernel[0],
-            STRIDE * (width - 1) + kernel[1],
-        ];
-        let mut image = bias.repeat(size[0] * size[1]);
-        assert_eq!(input.len(), height * width * inputs);
+    ) -> Vec<f32> {
+        let pixels = to[1] * to[2];
+        let mut image: Vec<f32> = bias.iter().flat_map(|bias| vec![*bias; pixels]).collect();
         for (place, value) in input.iter().enumerate() {
-            let (pixel, channel) = (place / inputs, place % inputs);
-            let (row, column) = (pixel / width * STRIDE, pixel % width * STRIDE);
-            for term in 0..kernel[0] * kernel[1] * outputs {
-                let (at, output) = (term / outputs, term % outputs);
+            let (channel, pixel) = (place / (from[1] * from[2]), place % (from[1] * from[2]));
+            let (row, column) = (pixel / from[2] * STRIDE, pixel % from[2] * STRIDE);
+            let window = kernel[0] * kernel[1];
+            for term in 0..to[0] * window {
+                let (output, at) = (term / window, term % window);
                 let (down, right) = (at / kernel[1], at % kernel[1]);
-                let into = ((row + down) * size[1] + column + right) * outputs + output;
-                let weight = weights[channel * kernel[0] * kernel[1] * outputs + term];
-                image[into] += value * weight;
+                image[output * pixels + (row + down) * to[2] + column + right] +=
+                    value * weights[channel * to[0] * window + term];
             }
         }
-        (image, size)
+        image
     }
 
     #[test]
-    fn an_image_is_what_the_layers_definitions_say() {
+    fn an_image_is_what_pytorchs_definitions_say() {
         let latent = 8;
-        let tensors: Vec<(&str, Vec<f32>)> = (1..)
-            .zip(Decoder::tensors(latent))
-            .map(|(seed, (name, len))| (name, (0..len).map(|at| number(at + seed)).collect()))
-            .collect();
-        let tensor = |name: &str| {
-            let found = tensors.iter().find(|(known, _)| *known == name);
-            found.unwrap().1.as_slice()
+        let tensors = TrainedDecoder::tensors(latent);
+        let seeded = (1..).zip(&tensors);
+        let values =
+            seeded.flat_map(|(seed, tensor)| tensor.range.clone().map(move |at| at + seed));
+        let trained = TrainedDecoder {
+            values: values.map(number).collect(),
+            latent,
+            encoder_sha256: String::new(),
         };
+        let tensor = |place: usize| &trained.values[tensors[place].range.clone()];
         let code: Vec<f32> = (0..latent).map(|at| number(at) * 30.0).collect();
-        let decoder = Decoder::new(Isa::best(), tensor);
 
-        let rows = tensor("decoder.linear.weight").chunks(latent);
-        let mut image: Vec<f32> = rows
-            .zip(tensor("decoder.linear.bias"))
+        let mut image: Vec<f32> = tensor(0)
+            .chunks(latent)
+            .zip(tensor(1))
             .map(|(row, bias)| {
                 let terms = row.iter().zip(&code).map(|(weight, value)| weight * value);
                 (bias + terms.sum::<f32>()).max(0.0)
             })
             .collect();
-        let mut size = [1, UNFOLDED];
-        for layer in 0..4 {
-            let name = |part: &str| format!("decoder.conv{}.{part}", layer + 1);
-            let channels = [CHANNELS[layer], CHANNELS[layer + 1]];
-            let (weights, bias) = (tensor(&name("weight")), tensor(&name("bias")));
-            (image, size) = transposed(&image, size, channels, KERNELS[layer], weights, bias);
+        for (layer, kernel) in DECODER_KERNELS.into_iter().enumerate() {
+            let maps = [DECODER_MAPS[layer], DECODER_MAPS[layer + 1]];
+            let (weights, bias) = (tensor(2 * layer + 2), tensor(2 * layer + 3));
+            image = transposed(&image, maps, kernel, weights, bias);
             if layer < 3 {
                 image.iter_mut().for_each(|value| *value = value.max(0.0));
             }
         }
         let expected = image.iter().map(|value| 255.0 / (1.0 + (-value).exp()));
-        let found = decoder.decode(&code);
+        let found = Decoder::new(Isa::best(), &trained).decode(&code);
         assert_eq!(found.len(), IMAGE_PIXELS);
         for (found, expected) in found.iter().zip(expected) {
             assert!(

@@ -65,6 +65,9 @@ impl RunDirectory {
         best_snapshot => "snapshots/best.safetensors",
         /// The newest snapshot.
         latest_snapshot => "snapshots/latest.safetensors",
+        /// The decoder of a plain VAE, or the one that came with the encoder: for people who look
+        /// at latent codes.
+        decoder => "decoder.safetensors",
         /// Checkpoints, from which the learner resumes.
         checkpoints => "checkpoints",
         /// [`EvaluationReport`](skein_protocol::evaluation::EvaluationReport) of the best snapshot.

@@ -179,6 +179,7 @@ drive! {
     no_snapshot_file_panics_and_accepted_ones_are_finite => "snapshot_file",
     no_received_snapshot_panics_and_accepted_ones_equal_the_sent_one => "snapshot_received",
     no_encoder_file_panics_and_accepted_ones_are_finite => "encoder_file",
+    no_decoder_file_panics => "decoder_file",
     no_checkpoint_file_panics_and_loaded_state_can_be_used => "checkpoint",
     no_replay_content_panics_and_restored_content_can_be_continued => "replay",
     no_episodes_csv_panics_and_a_continued_one_can_be_continued_again => "episodes_csv",

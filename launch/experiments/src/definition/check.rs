@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use serde::Serialize;
-use skein_protocol::config::Config;
+use skein_protocol::config::{Config, CoursesSection};
 use skein_simulator::suite::MOST_EPISODES;
 use skein_simulator::text::{first_repeated, fits_in_a_table};
 use toml::Value;
@@ -62,6 +62,7 @@ pub(super) fn resolve(
     }
     check_different(&arms, path)?;
     check_comparable(&arms, path)?;
+    check_same_courses(&file, &arms, path)?;
     check_same_episodes(&file, &arms, path)?;
     check_same_reward(&file, &arms, path)?;
     let suite = suite_of(&file, folder, &arms, path)?;
@@ -82,6 +83,7 @@ pub(super) fn resolve(
         suite,
         tables: file.tables,
         curves: file.curves,
+        factor: file.factor,
         arms,
     })
 }
@@ -117,6 +119,7 @@ fn arm_of(
     Ok(Arm {
         name: arm.name.clone(),
         label: arm.label.clone(),
+        at: arm.at.clone(),
         settings,
         overrides,
         config,
@@ -233,6 +236,7 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
         );
         return refuse("[[arm]]", &file.arms.len(), &problem);
     }
+    check_factor(file, path)?;
     let (mut names, mut labels) = (BTreeSet::new(), BTreeSet::new());
     for arm in &file.arms {
         if !names_folder(&arm.name) || arm.name == REPORT {
@@ -268,6 +272,38 @@ fn check_values(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionErro
     Ok(())
 }
 
+/// Refuses a factor that an arm lacks, a place without a factor, and what a picture cannot show.
+fn check_factor(file: &ExperimentFile, path: &Path) -> Result<(), DefinitionError> {
+    let is_text = |text: &str| !text.trim().is_empty() && fits_in_a_table(text);
+    if let Some(factor) = &file.factor
+        && !is_text(factor)
+    {
+        let problem = "cannot label an axis: write a name and its unit on one line without |";
+        return Err(value_error(
+            path,
+            "factor",
+            format!("{factor:?}"),
+            problem.into(),
+        ));
+    }
+    for arm in &file.arms {
+        let problem = match (&file.factor, &arm.at) {
+            (None, Some(_)) => {
+                "has `at`, but the file names no factor: add factor = \"NAME, UNIT\""
+            }
+            (Some(_), None) => "has no place: add at = { line = \"NAME\", value = NUMBER }",
+            (Some(_), Some(at)) if !at.value.is_finite() => "has a value that is no finite number",
+            (Some(_), Some(at)) if !is_text(&at.line) => {
+                "has a line that cannot be a caption: write one line of text without |"
+            }
+            _ => continue,
+        };
+        let whose = format!("arm {}", arm.name);
+        return Err(settings_error(path, &whose, problem.to_owned()));
+    }
+    Ok(())
+}
+
 /// Returns `value` as it stands in the file.
 fn as_written(value: &impl Serialize) -> String {
     Value::try_from(value).map_or_else(|error| error.to_string(), |value| value.to_string())
@@ -290,16 +326,36 @@ fn check_different(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
 
 /// Refuses arms that are evaluated differently.
 fn check_comparable(arms: &[Arm], path: &Path) -> Result<(), DefinitionError> {
-    let measured = |arm: &Arm| {
-        (
-            arm.config.evaluation.clone(),
-            arm.config.courses.evaluation.clone(),
-        )
-    };
+    let measured = |arm: &Arm| arm.config.evaluation.clone();
     refuse_other(arms, path, measured, |first| {
         format!(
-            "[evaluation] and courses.evaluation differ from those of arm {first}, \
-                so the two could not be compared: set them in [settings]"
+            "[evaluation] differs from that of arm {first}, \
+                so the two could not be compared: set it in [settings]"
+        )
+    })
+}
+
+/// Refuses arms that are evaluated on other courses. Where a factor is what changes the courses,
+/// only their names must be the same: they are the columns of the tables.
+fn check_same_courses(
+    file: &ExperimentFile,
+    arms: &[Arm],
+    path: &Path,
+) -> Result<(), DefinitionError> {
+    let evaluated = |arm: &Arm| arm.config.courses.evaluation.clone();
+    if file.factor.is_none() {
+        return refuse_other(arms, path, evaluated, |first| {
+            format!(
+                "courses.evaluation differs from that of arm {first}, \
+                    so the two could not be compared: set it in [settings]"
+            )
+        });
+    }
+    let names = |arm: &Arm| CoursesSection::names(&evaluated(arm));
+    refuse_other(arms, path, names, |first| {
+        format!(
+            "courses.evaluation has other names than that of arm {first}, \
+                so they could not share a table: give the course files the same `name`"
         )
     })
 }
@@ -309,14 +365,16 @@ const ELSEWHERE: &str = ", so the two would be measured on different episodes: \
                          add a suite, and write tables = [\"suite\", \"cost\"] and curves = []";
 
 /// Refuses tables and curves of the arms' own episodes (training and evaluation) if these differ in
-/// kind. A suite flies all arms alike, whatever their training.
+/// kind, unless a factor is what makes them differ. A suite flies all arms alike, whatever their
+/// training.
 fn check_same_episodes(
     file: &ExperimentFile,
     arms: &[Arm],
     path: &Path,
 ) -> Result<(), DefinitionError> {
     let of_own_episodes = |kind: &TableKind| !matches!(kind, TableKind::Suite | TableKind::Cost);
-    if file.curves.is_empty() && !file.tables.iter().any(of_own_episodes) {
+    let are_shown = !file.curves.is_empty() || file.tables.iter().any(of_own_episodes);
+    if file.factor.is_some() || !are_shown {
         return Ok(());
     }
     let courses = |arm: &Arm| {

@@ -9,7 +9,7 @@ use skein_protocol::config::{FILE_KEYS, integer_too_large};
 use skein_protocol::files::{self, SETTINGS_BYTES};
 use toml::{Table, Value};
 
-use super::{CurveSpec, DefinitionError, TableKind};
+use super::{CurveSpec, DefinitionError, FactorPoint, TableKind};
 
 /// Contents of an experiment's file.
 #[derive(Debug, Deserialize)]
@@ -31,6 +31,8 @@ pub(super) struct ExperimentFile {
     pub(super) settings: Table,
     pub(super) tables: Vec<TableKind>,
     pub(super) curves: Vec<CurveSpec>,
+    /// Name and unit of the number of which each arm states its own.
+    pub(super) factor: Option<String>,
     #[serde(rename = "arm")]
     pub(super) arms: Vec<ArmFile>,
 }
@@ -41,6 +43,7 @@ pub(super) struct ExperimentFile {
 pub(super) struct ArmFile {
     pub(super) name: String,
     pub(super) label: String,
+    pub(super) at: Option<FactorPoint>,
     #[serde(default)]
     pub(super) settings: Table,
 }

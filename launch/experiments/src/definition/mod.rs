@@ -47,6 +47,9 @@ pub struct Experiment {
     pub tables: Vec<TableKind>,
     /// Pictures of the report.
     pub curves: Vec<CurveSpec>,
+    /// Name and unit of a number in which arms differ; then each has its [`Arm::at`], and a picture
+    /// shows R over it. Arms may fly other courses.
+    pub factor: Option<String>,
     /// Arms that are compared.
     pub arms: Vec<Arm>,
 }
@@ -83,6 +86,8 @@ pub struct Arm {
     pub name: String,
     /// Label in tables and pictures.
     pub label: String,
+    /// Where it stands in the pictures over [`Experiment::factor`].
+    pub at: Option<FactorPoint>,
     /// Settings in which it differs from the other arms: `section.key=value`.
     pub settings: Vec<String>,
     /// All settings beyond the base configuration, except the seed, as arguments of `--set` in this
@@ -90,6 +95,16 @@ pub struct Arm {
     pub overrides: Vec<String>,
     /// Resulting configuration, for seed 1.
     pub config: Config,
+}
+
+/// Place of an arm in the pictures over a factor.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FactorPoint {
+    /// Picture of the arm: those with the same line are drawn together.
+    pub line: String,
+    /// The arm's value of the factor.
+    pub value: f64,
 }
 
 /// A table of a report.

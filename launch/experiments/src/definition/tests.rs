@@ -601,3 +601,64 @@ fn a_missing_file_and_a_link_to_nothing_are_refused_with_what_to_give() {
         refused(named, "a link to g.toml, which does not exist");
     }
 }
+
+/// An arm at `value` that trains on and evaluates a course of its own.
+fn arm_at(value: &str, course: &str) -> String {
+    format!(
+        "[[arm]]\nname = \"{course}\"\nlabel = \"{course}\"\n\
+         at = {{ line = \"one\", value = {value} }}\n\
+         settings.courses.training = \"{course}.toml\"\n\
+         settings.courses.evaluation = [\"{course}.toml\"]\n"
+    )
+}
+
+#[test]
+fn arms_along_a_factor_fly_courses_of_the_same_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let course = fs::read_to_string(shipped("courses/training.toml")).unwrap();
+    let load = |second: &str, factor: &str, arms: &str| {
+        fs::write(folder.path().join("narrow.toml"), &course).unwrap();
+        fs::write(folder.path().join("wide.toml"), second).unwrap();
+        let text = format!("{}{factor}{arms}", head());
+        fs::write(folder.path().join("test.toml"), text).unwrap();
+        Experiment::load(folder.path(), "test", None)
+            .map_err(|error| skein_run::failure::with_causes(&error))
+    };
+    let wider = course.replace("width_m = 2.2", "width_m = 2.4");
+    let arms = arm_at("2.2", "narrow") + &arm_at("2.4", "wide");
+    let factor = "factor = \"width, m\"\n";
+    let experiment = load(&wider, factor, &arms).unwrap();
+    let values = experiment
+        .arms
+        .iter()
+        .map(|arm| arm.at.as_ref().unwrap().value);
+    assert_eq!(values.collect::<Vec<_>>(), [2.2, 2.4]);
+
+    let renamed = wider.replace("name = \"training\"", "name = \"other\"");
+    for (second, factor, arms, problem) in [
+        (&renamed, factor, arms.clone(), "other names"),
+        (&wider, "", arms.clone(), "names no factor"),
+        (&wider, factor, format!("{arms}{ARM}"), "has no place"),
+        (
+            &wider,
+            "factor = \" \"\n",
+            arms.clone(),
+            "cannot label an axis",
+        ),
+        (
+            &wider,
+            factor,
+            arms.replace("2.4 }", "nan }"),
+            "no finite number",
+        ),
+        (
+            &wider,
+            factor,
+            arms.replace("\"one\"", "\"a|b\""),
+            "cannot be a caption",
+        ),
+    ] {
+        let error = load(second, factor, &arms).unwrap_err();
+        assert!(error.contains(problem), "{error}");
+    }
+}

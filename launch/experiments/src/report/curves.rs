@@ -1,7 +1,9 @@
 //! Pictures of a report.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
+use super::tables::course_of;
 use super::{ExperimentReportError, Findings, Picture};
 use crate::definition::{Axis, CurveSpec, Measure};
 use crate::results::RunResult;
@@ -26,7 +28,69 @@ impl Findings<'_> {
                 Err(error) => failures.push(error),
             }
         }
+        for (number, line) in self.factor_lines().into_iter().enumerate() {
+            match self.over_factor(number + 1, line, folder) {
+                Ok(picture) => pictures.extend(picture),
+                Err(error) => failures.push(error),
+            }
+        }
         (pictures, failures)
+    }
+
+    /// Returns the lines of the experiment's factor, each once, in the order of the arms.
+    fn factor_lines(&self) -> Vec<&str> {
+        let arms = self.experiment.arms.iter();
+        let mut lines: Vec<_> = arms
+            .filter_map(|arm| Some(&*arm.at.as_ref()?.line))
+            .collect();
+        let mut seen = BTreeSet::new();
+        lines.retain(|line| seen.insert(*line));
+        lines
+    }
+
+    /// Draws R on each course over the factor, for the arms of one line.
+    fn over_factor(
+        &self,
+        number: usize,
+        line: &str,
+        folder: &Path,
+    ) -> Result<Option<Picture>, ExperimentReportError> {
+        let Some(factor) = &self.experiment.factor else {
+            return Ok(None);
+        };
+        let courses = self.courses();
+        let comparison = Comparison {
+            title: format!("R of the best snapshot by course: {line}"),
+            x: factor,
+            y: "R, share of walls passed",
+            level: None,
+            lines: courses
+                .iter()
+                .map(|course| ComparedLine {
+                    label: course,
+                    points: self.course_over_factor(line, course),
+                })
+                .collect(),
+        };
+        let file = format!("r_over_factor_{number}.png");
+        let is_drawn = comparison.draw(&folder.join(&file))?;
+        let caption = format!("R by course over the {factor}: {line}");
+        Ok(is_drawn.then_some(Picture { file, caption }))
+    }
+
+    fn course_over_factor(&self, line: &str, course: &str) -> Vec<BandPoint> {
+        let of_course = |result: &RunResult| course_of(result, course).map(|course| course.r);
+        let arms = self.experiment.arms.iter().enumerate();
+        let mut points: Vec<_> = arms
+            .filter_map(|(number, arm)| {
+                let at = arm.at.as_ref().filter(|at| at.line == line)?;
+                let Estimate { value, interval } = self.estimate(number, of_course)?;
+                let x = at.value;
+                Some(BandPoint { x, value, interval })
+            })
+            .collect();
+        points.sort_by(|one, other| one.x.total_cmp(&other.x));
+        points
     }
 
     fn picture(

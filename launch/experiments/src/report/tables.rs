@@ -446,7 +446,11 @@ impl Findings<'_> {
 
     /// Returns the estimate of `of_run` over the complete runs of an arm; `None` if a run has no
     /// value.
-    fn estimate(&self, arm: usize, of_run: impl Fn(&RunResult) -> Option<f64>) -> Option<Estimate> {
+    pub(super) fn estimate(
+        &self,
+        arm: usize,
+        of_run: impl Fn(&RunResult) -> Option<f64>,
+    ) -> Option<Estimate> {
         self.bootstrap(arm, RESAMPLES)
             .interquartile_mean(&self.values(arm, of_run)?)
     }

@@ -67,7 +67,7 @@ impl Target {
 const USUAL: usize = 200;
 
 /// All targets.
-pub static TARGETS: [Target; 25] = [
+pub static TARGETS: [Target; 26] = [
     configuration::CONFIG,
     configuration::OVERRIDES,
     configuration::SIMULATOR,
@@ -81,6 +81,7 @@ pub static TARGETS: [Target; 25] = [
     snapshots::FILE,
     snapshots::RECEIVED,
     snapshots::ENCODER,
+    snapshots::DECODER,
     checkpoints::FILES,
     replay::REPLAY,
     checkpoints::EPISODES_CSV,

@@ -52,7 +52,8 @@ static SOUND: LazyLock<Vec<u8>> = LazyLock::new(|| {
         "/../../configs/courses/training.toml"
     );
     let course = Course::load(course).unwrap();
-    let mut recording = Recording::create(&path, &settings, LENGTHS.action, &["a course"]).unwrap();
+    let mut recording =
+        Recording::create(&path, &settings, LENGTHS.action, &["a course"], None).unwrap();
     let episode = Episode {
         title: "an episode",
         course: (&course, 0),

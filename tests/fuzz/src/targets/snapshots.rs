@@ -7,6 +7,7 @@ use std::sync::LazyLock;
 
 use bytemuck::{bytes_of, cast_slice};
 use skein_protocol::config::Config;
+use skein_protocol::decoder_file::TrainedDecoder;
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::ids::{PolicyVersion, RunId};
 use skein_protocol::snapshot::{Snapshot, SnapshotHeader, SnapshotLayout};
@@ -33,6 +34,15 @@ pub(super) const ENCODER: Target = Target {
     run: encoder,
 };
 
+pub(super) const DECODER: Target = Target {
+    name: "decoder_file",
+    reads: "decoder files: the safetensors header and metadata, before valid parameters",
+    longest_bytes: FILE.longest_bytes,
+    weight: USUAL / 4,
+    samples: || vec![DECODER_HEADER.clone(), SOUND.header.clone()],
+    run: decoder,
+};
+
 pub(super) const RECEIVED: Target = Target {
     name: "snapshot_received",
     reads: "snapshots off the wire: header, then changes to a valid one's bytes",
@@ -43,6 +53,8 @@ pub(super) const RECEIVED: Target = Target {
 };
 
 const RUN: RunId = RunId(1);
+/// Size of a number in half precision.
+const HALF_BYTES: usize = 2;
 
 /// The file of a small policy's snapshot, in two parts, and the header of its encoder's own file.
 struct ValidSnapshot {
@@ -81,6 +93,21 @@ static SOUND: LazyLock<ValidSnapshot> = LazyLock::new(|| {
     }
 });
 
+/// The header of a decoder's file whose parameters are zero.
+static DECODER_HEADER: LazyLock<Vec<u8>> = LazyLock::new(|| {
+    let parameters = TrainedDecoder::tensors(1)
+        .last()
+        .map_or(0, |last| last.range.end);
+    let decoder = TrainedDecoder {
+        values: vec![0.0; parameters],
+        latent: 1,
+        encoder_sha256: "0".repeat(64),
+    };
+    let mut header = decoder.to_file();
+    header.truncate(header.len() - parameters * HALF_BYTES);
+    header
+});
+
 thread_local! {
     /// Values of a valid snapshot after room for a header, so that 3 MB need not be copied per
     /// input.
@@ -108,6 +135,20 @@ fn file(bytes: &[u8]) -> ReaderDecision {
         });
         ReaderDecision::of(sound.into_iter().flatten().next())
     })
+}
+
+/// Parses a decoder's file, before zeros for parameters and without any.
+fn decoder(bytes: &[u8]) -> ReaderDecision {
+    let parameters = TrainedDecoder::tensors(1)
+        .last()
+        .map_or(0, |last| last.range.end);
+    let mut whole = bytes.to_vec();
+    if let Some(length) = whole.first_chunk_mut::<8>() {
+        *length = (bytes.len() as u64 - 8).to_le_bytes();
+    }
+    whole.resize(whole.len() + parameters * HALF_BYTES, 0);
+    let sound = [&*whole, bytes].map(|file| TrainedDecoder::parse(file).ok());
+    ReaderDecision::of(sound.into_iter().flatten().next())
 }
 
 /// Puts a header before the values. Returns its place.
