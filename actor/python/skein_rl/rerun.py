@@ -102,7 +102,7 @@ def _log_episode(
         for name, value in zip(recording.reward_term_names, episode["reward_terms"][row]):
             stream.log(f"reward/{name}", rr.Scalars(float(value)))
         for who in ("action", "oracle_action"):
-            for axis, value in zip(("left", "up"), episode[who][row] if who in episode else ()):
+            for axis, value in zip(recording.action_names, episode[who][row] if who in episode else ()):
                 stream.log(f"{who}/{axis}", rr.Scalars(float(value)))
 
 
