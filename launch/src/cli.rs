@@ -185,6 +185,16 @@ pub(crate) struct ExperimentArguments {
     /// Runs at a time [default: number of cores].
     #[arg(long, value_name = "J", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) jobs: Option<u16>,
+    /// Print a command for each run that is not complete, one a line, and run nothing: for GNU
+    /// parallel, xargs, or an array of Slurm jobs.
+    ///
+    /// Each host needs the repository at the same commit. Give --runs a folder that all share, or
+    /// copy what they left into one; --report then gathers it.
+    #[arg(long, conflicts_with_all = ["report", "publish", "job", "jobs"])]
+    pub(crate) list_jobs: bool,
+    /// Run only this one of the runs, as --list-jobs names it, and report nothing.
+    #[arg(long, value_name = "ARM/seed-N", conflicts_with_all = ["report", "publish", "jobs"])]
+    pub(crate) job: Option<String>,
     /// Shorten every run to N training episodes, in a folder of its own:
     /// runs/experiments/NAME_N_episodes.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]

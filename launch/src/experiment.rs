@@ -80,6 +80,9 @@ impl ExperimentArguments {
             .then(|| Publication::find(&self.repository, name))
             .transpose()?;
 
+        if self.list_jobs {
+            return self.print_jobs(&experiment, &root, seeds);
+        }
         let mut status = ExitCode::SUCCESS;
         if !self.report {
             let session = self.run(&experiment, &root, seeds)?;
@@ -100,6 +103,9 @@ impl ExperimentArguments {
                 status = ExitCode::FAILURE;
             }
         }
+        if self.job.is_some() {
+            return Ok(status);
+        }
         let are_all_read = self.report_results(&experiment, &root, seeds, publication.as_ref())?;
         Ok(match are_all_read {
             true => status,
@@ -107,9 +113,30 @@ impl ExperimentArguments {
         })
     }
 
+    /// Prints a command for each run that is not complete.
+    fn print_jobs(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<ExitCode> {
+        let plan = ExperimentPlan::new(experiment, root, seeds)?;
+        let command = self.command(experiment, Options::All);
+        for run in plan
+            .runs
+            .iter()
+            .filter(|run| run.state != RunState::Complete)
+        {
+            show!("{command} --job {}", run.name);
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+
     fn run(&self, experiment: &Experiment, root: &Path, seeds: u64) -> Result<SessionOutcome> {
-        let _claim = ExperimentPlan::claim(root)?;
+        // A job shares the folder with others; the lock of its run keeps it to one process.
+        let _claim = match self.job {
+            None => Some(ExperimentPlan::claim(root)?),
+            Some(_) => None,
+        };
         let mut plan = ExperimentPlan::new(experiment, root, seeds)?;
+        if let Some(job) = &self.job {
+            plan.keep_only(job)?;
+        }
         plan.check_idle()?;
         for (run, other) in plan.link_trained_runs()? {
             note!(
@@ -215,6 +242,7 @@ impl ExperimentArguments {
             option("--jobs", self.jobs.map(|jobs| jobs.to_string()));
             option("--runs", self.runs.as_deref().map(quoted));
             option("--publish", self.publish.then(String::new));
+            option("--job", self.job.clone());
         }
         command.trim_end().to_owned()
     }

@@ -126,6 +126,7 @@ fn an_experiment_is_interrupted_resumed_reported_and_published() {
         .flat_map(|&seed| ["one-part", "half"].map(|arm| scene.run(arm, seed)))
         .collect();
 
+    assert_a_job_runs_alone(&scene, &runs);
     let mut experiment = scene.start();
     until("the first run has episodes", || {
         (episodes(&runs[0]).len() >= 20).then_some(())
@@ -192,6 +193,26 @@ fn an_experiment_is_interrupted_resumed_reported_and_published() {
     assert_only_the_suite_is_flown_again(&scene, &runs);
     assert_a_suite_is_flown_as_often_as_the_experiment_says(&scene, &runs);
     assert_refused_when_changed(&scene);
+}
+
+/// Runs the last of the four commands of the list, which trains `runs[3]` alone.
+fn assert_a_job_runs_alone(scene: &Scene, runs: &[RunDirectory]) {
+    let listed = || scene.finish(&["--list-jobs"]).stdout;
+    let all = listed();
+    let jobs: Vec<_> = all.lines().collect();
+    assert_eq!(jobs.len(), 4, "{all}");
+    let job = jobs[3].strip_prefix("launch/experiment.sh tiny ").unwrap();
+    assert_eq!(job, "--job half/seed-2");
+    let output = scene.finish(&job.split(' ').collect::<Vec<_>>());
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    assert!(completed(&runs[3]) && !runs[0].root().exists());
+    assert!(!scene.path("runs/experiments/tiny/report").exists());
+    assert_eq!(listed(), all.replace(&format!("{}\n", jobs[3]), ""));
+    let output = scene.finish(&["--job", "half/seed-9"]);
+    assert_eq!(output.code, Some(1));
+    for part in ["half/seed-9", "one-part/seed-1", "--list-jobs"] {
+        assert!(output.stderr.contains(part), "{}", output.stderr);
+    }
 }
 
 #[test]

@@ -79,6 +79,14 @@ pub enum PlanError {
         #[source]
         source: io::Error,
     },
+    /// No run has this name.
+    #[error("no run of the experiment is called {name}: {first} is one; --list-jobs prints all")]
+    NoSuchRun {
+        /// The name.
+        name: String,
+        /// Name of the first run.
+        first: String,
+    },
     /// Another process runs the experiment.
     #[error("{} is under way already: wait for it, or stop it first", .0.display())]
     UnderWay(PathBuf),
@@ -141,6 +149,22 @@ impl ExperimentPlan {
                 root: plan.root,
                 problems,
             }),
+        }
+    }
+
+    /// Leaves only the run called `name`, `ARM/seed-N`.
+    ///
+    /// # Errors
+    /// [`PlanError::NoSuchRun`] names one that there is.
+    pub fn keep_only(&mut self, name: &str) -> Result<(), PlanError> {
+        let first = self.runs.first().map(|run| run.name.clone());
+        self.runs.retain(|run| run.name == name);
+        match self.runs.is_empty() {
+            true => Err(PlanError::NoSuchRun {
+                name: name.to_owned(),
+                first: first.unwrap_or_default(),
+            }),
+            false => Ok(()),
         }
     }
 
