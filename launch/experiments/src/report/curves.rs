@@ -78,7 +78,7 @@ impl Findings<'_> {
         Ok(is_drawn.then_some(Picture { file, caption }))
     }
 
-    fn course_over_factor(&self, line: &str, course: &str) -> Vec<BandPoint> {
+    pub(super) fn course_over_factor(&self, line: &str, course: &str) -> Vec<BandPoint> {
         let of_course = |result: &RunResult| course_of(result, course).map(|course| course.r);
         let arms = self.experiment.arms.iter().enumerate();
         let mut points: Vec<_> = arms

@@ -8,7 +8,7 @@ use skein_protocol::ids::PolicyVersion;
 use skein_protocol::transition::Outcome;
 
 use super::*;
-use crate::definition::{Axis, CurveSpec, Measure, TableKind};
+use crate::definition::{Axis, CurveSpec, FactorPoint, Measure, TableKind};
 use crate::plan::{PlannedRun, RunState};
 use crate::results;
 
@@ -286,6 +286,37 @@ fn runs_of_several_builds_are_marked() {
         two.contains("Skein 0, 0+b873565.\n") && two.contains(several),
         "{two}"
     );
+}
+
+#[test]
+fn each_line_of_a_factor_has_a_picture_of_the_courses_over_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let more = "[[arm]]\nname = \"b\"\nlabel = \"B\"\nsettings.replay.success_share = 0.3\n";
+    let (mut experiment, plan) = runs(folder.path(), more, &[2; 4]);
+    experiment.factor = Some("width, m".to_owned());
+    for (arm, value) in experiment.arms.iter_mut().zip([3.0, 2.0]) {
+        let line = "narrow".to_owned();
+        arm.at = Some(FactorPoint { line, value });
+    }
+    for (run, completed) in plan.runs.iter().zip([1, 2, 3, 4]) {
+        let report = EvaluationReport {
+            policy_version: PolicyVersion(7),
+            policy_sha256: String::new(),
+            courses: vec![entry_result("training", completed)],
+        };
+        let report = serde_json::to_string(&report).unwrap();
+        fs::write(run.directory.evaluation_json(), report).unwrap();
+    }
+    let results = read(&plan);
+    let findings = findings(&experiment, &plan, &results);
+    // First seeds come first: A completed 1 and 3 of 4 episodes, B 2 and 4.
+    let points = findings.course_over_factor("narrow", "training");
+    let placed: Vec<_> = points.iter().map(|point| (point.x, point.value)).collect();
+    assert_eq!(placed, [(2.0, 0.75), (3.0, 0.5)]);
+    let (pictures, failures) = findings.draw(folder.path());
+    assert!(failures.is_empty(), "{failures:?}");
+    assert_eq!(pictures[0].caption, "R by course over the width, m: narrow");
+    assert!(folder.path().join(&pictures[0].file).exists());
 }
 
 #[test]
