@@ -134,7 +134,7 @@ impl Recorder {
         match writer.try_send(flown) {
             Ok(()) => {}
             Err(TrySendError::Full(flown)) => {
-                debug!(episode = %flown.ticket.episode, "not recorded: the writer is busy");
+                warn!(episode = %flown.ticket.episode, "not recorded: the writer is busy");
                 self.tape = flown.records;
             }
             Err(TrySendError::Disconnected(_)) => warn!("not recorded: the writer has ended"),
@@ -237,7 +237,10 @@ fn write(flown: &Flown, path: &Path, courses: &Courses, lengths: RecordLengths) 
     let (course, settings) = courses.course(&flown.ticket).map_err(io::Error::other)?;
     let (title, number) = match flown.ticket.episode.in_evaluation() {
         Some((evaluation, number)) => (
-            format!("evaluation {evaluation}, episode {number}"),
+            format!(
+                "{}, evaluation {evaluation}, episode {number}",
+                course.name()
+            ),
             number as i32,
         ),
         None => (format!("training episode {}", flown.ticket.episode), 0),
@@ -407,7 +410,7 @@ mod tests {
         record_one(&recordings);
         let path = recordings.join("evaluation-0-3-collided-2of5.mcap");
         let flights = skein_recordings::read(&fs::read(path).unwrap()).unwrap();
-        assert_eq!(flights[0].title, "evaluation 0, episode 3");
+        assert_eq!(flights[0].title, "training, evaluation 0, episode 3");
         assert_eq!((flights[0].steps.len(), flights[0].walls.len()), (2, 5));
         assert_eq!(fs::read_dir(recordings).unwrap().count(), 1);
     }

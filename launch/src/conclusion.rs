@@ -162,6 +162,10 @@ fn artefacts(run: &RunDirectory) -> Vec<(PathBuf, &'static str)> {
             "full state of the learner, to resume from",
         ),
         (
+            run.recordings(),
+            "recorded episodes: launch/watch.sh plays them",
+        ),
+        (
             run.tensorboard(),
             "training curves: tensorboard --logdir DIR",
         ),

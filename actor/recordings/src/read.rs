@@ -130,7 +130,10 @@ pub fn images(file: &[u8], number: usize) -> io::Result<Vec<u8>> {
             false => Ok(()),
         }
     })?;
-    Ok(images)
+    match begun > number {
+        true => Ok(images),
+        false => Err(io::Error::other(format!("it has no episode {number}"))),
+    }
 }
 
 /// Calls `take` with topic, time in nanoseconds and content of each message that Skein knows.

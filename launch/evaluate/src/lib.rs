@@ -162,7 +162,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let episodes = courses.evaluation().map(|entry| entry.episodes).sum();
         check_recording(episodes, courses.most_records(), free_memory())?;
     }
-    let decoder = match arguments.record.is_some() || arguments.gif.is_some() {
+    let recording = arguments.record.as_deref();
+    let decoder = match recording.is_some_and(is_mcap) || arguments.gif.is_some() {
         true => decoder(&arguments.subject, &path, &snapshot, &config)?,
         false => None,
     };
@@ -232,6 +233,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     });
     let recorded = arguments.record.as_ref().map_or(Ok(()), |file| {
         let lengths = config.record_lengths();
+        note!("recording: {}", file.display());
         record(file, &courses, lengths, decoder, &evaluated.episodes)
     });
     let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
@@ -282,6 +284,11 @@ fn decoder(
     Ok(trained.map(|trained| Decoder::new(Isa::best(), &trained)))
 }
 
+fn is_mcap(file: &Path) -> bool {
+    file.extension()
+        .is_some_and(|extension| extension == "mcap")
+}
+
 /// Writes a recording in the format that the file's name asks for.
 fn record(
     file: &Path,
@@ -290,11 +297,11 @@ fn record(
     decoder: Option<&Decoder>,
     episodes: &[Vec<EvaluatedEpisode>],
 ) -> Result<(), RecordingError> {
-    match file.extension() {
-        Some(extension) if extension == "mcap" => write_atomically(file, |file| {
+    match is_mcap(file) {
+        true => write_atomically(file, |file| {
             mcap::write(file, courses, lengths, decoder, episodes)
         }),
-        _ => {
+        false => {
             let entries = courses.evaluation();
             let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
             write_recording(file, &names, lengths, episodes)

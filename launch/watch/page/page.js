@@ -222,8 +222,14 @@ function table(titles, rows, numbers) {
 async function actors() {
   const nodes = [];
   for (const id of state.chosen) {
-    const run = await ask("run", [["run", id]]);
     nodes.push(element("h2", {}, id));
+    let run;
+    try {
+      run = await ask("run", [["run", id]]);
+    } catch (error) {
+      nodes.push(element("p", { class: "problem" }, error.message));
+      continue;
+    }
     if (run.latest) {
       const [walls, reward] = run.latest.map((value) => value.toFixed(2));
       nodes.push(element("p", {}, `last 50 episodes: ${walls} walls passed, return ${reward}`));
@@ -245,7 +251,7 @@ async function actors() {
 }
 
 async function settings() {
-  const runs = await Promise.all(state.chosen.map((id) => ask("run", [["run", id]])));
+  const runs = await Promise.all(state.chosen.map((id) => ask("run", [["run", id]]).catch((error) => ({ settings: {}, problem: error.message }))));
   const keys = [...new Set(runs.flatMap((run) => Object.keys(run.settings)))].sort();
   const differs = (key) => new Set(runs.map((run) => run.settings[key])).size > 1;
   const shown = runs.length > 1 ? [...keys.filter(differs), ...keys.filter((key) => !differs(key))] : keys;
@@ -401,7 +407,9 @@ async function flights(kept) {
   const source = select("Flights", [["recordings", `recorded (${recordings.length})`], ["evaluation", "final evaluation: positions alone"]],
     state.source, (value) => { state.source = value; show(); });
   if (recordings.length > 0 && state.source === "recordings") return recordedFlight(kept, id, recordings, source);
-  if (recordings.length > 0) return evaluationFlight([source]);
+  if (recordings.length > 0) {
+    return evaluationFlight([source]).catch((error) => ({ nodes: [element("div", { class: "choices" }, source), element("p", { class: "hint" }, error.message)] }));
+  }
   const hint = element("p", { class: "hint" }, `${id} has no recordings. A run started with --set run.record_every=50 records each 50th training episode, `
     + "each course's first evaluation episode and those that failed, with what the camera sees and the reward.");
   try {
@@ -507,14 +515,19 @@ async function recordedFlight(kept, id, recordings, source) {
     view.querySelector(".recording")?.replaceWith(chosen);
     return null;
   }
-  const asked = [["run", id], ["name", state.recording], ["episode", `${state.episode}`]];
-  const [{ titles, flight }, depth] = await Promise.all([ask("recording", asked), askBytes("images", asked)]);
-  if (flight.steps.length === 0) throw new Error(`${state.recording} has no steps.`);
-  const choices = [source, chosen];
-  if (titles.length > 1) choices.push(select("Episode", titles.map((title, number) => [`${number}`, title]), `${state.episode}`, (value) => { state.episode = Number(value); state.follow = false; show(); }));
   const follow = element("input", { type: "checkbox", onchange: (event) => { state.follow = event.target.checked; show(); } });
   follow.checked = state.follow;
-  choices.push(element("label", {}, follow, " follow the newest"));
+  const choices = [source, chosen, element("label", {}, follow, " follow the newest")];
+  const asked = [["run", id], ["name", state.recording], ["episode", `${state.episode}`]];
+  let answers;
+  try {
+    answers = await Promise.all([ask("recording", asked), askBytes("images", asked)]);
+    if (answers[0].flight.steps.length === 0) throw new Error(`${state.recording} has no steps.`);
+  } catch (error) {
+    return { nodes: [element("div", { class: "choices" }, ...choices), element("p", { class: "problem" }, error.message)] };
+  }
+  const [{ titles, flight }, depth] = answers;
+  if (titles.length > 1) choices.splice(2, 0, select("Episode", titles.map((title, number) => [`${number}`, title]), `${state.episode}`, (value) => { state.episode = Number(value); state.follow = false; show(); }));
 
   const points = flight.steps.map((step) => step.numbers.position_m);
   const drawn = scene(flight, points, outcomeOf(flight), flight.title);
@@ -548,7 +561,7 @@ async function recordedFlight(kept, id, recordings, source) {
       rewards.draw();
       reconstruct(asked).then((images) => {
         reconstructed = images;
-        coded.text.textContent = "what the newest checkpoint's decoder makes of its latent code";
+        coded.text.textContent = "what the decoder makes of its latent code";
         pictures();
       }).catch((error) => {
         coded.canvas.remove();

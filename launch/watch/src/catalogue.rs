@@ -131,6 +131,15 @@ impl Catalogue {
         }
     }
 
+    /// Returns `true` if a run has ended by itself. One that is lengthened has an older summary.
+    fn is_complete(&self, run: &RunDirectory) -> bool {
+        let changed = |path: PathBuf| fs::metadata(path).and_then(|file| file.modified()).ok();
+        let text = self.read_text(&run.summary_json()).unwrap_or_default();
+        let summary = serde_json::from_str::<serde_json::Value>(&text).unwrap_or_default();
+        summary["ending"] == "completed"
+            && changed(run.summary_json()) >= changed(run.episodes_csv())
+    }
+
     fn list(&self, path: &Path) -> Option<ListedRun> {
         let run = RunDirectory::new(path);
         let metadata = |path: PathBuf| fs::metadata(path).ok();
@@ -144,7 +153,7 @@ impl Catalogue {
         let last = last.into_iter().filter_map(changed).max()?;
         let id = path.strip_prefix(&self.root).ok()?.to_str()?.to_owned();
         let age = SystemTime::now().duration_since(last).unwrap_or_default();
-        let state = match (is_complete(&run), age < QUIET) {
+        let state = match (self.is_complete(&run), age < QUIET) {
             (true, _) => State::Complete,
             (false, true) => State::Running,
             (false, false) => State::Stopped,
@@ -158,14 +167,6 @@ impl Catalogue {
             episodes_bytes: metadata(run.episodes_csv()).map_or(0, |file| file.len()),
         })
     }
-}
-
-/// Returns `true` if a run has ended by itself. One that is lengthened has an older summary.
-fn is_complete(run: &RunDirectory) -> bool {
-    let changed = |path: PathBuf| fs::metadata(path).and_then(|file| file.modified()).ok();
-    let text = files::read_text(&run.summary_json(), REPORT_BYTES).unwrap_or_default();
-    let summary = serde_json::from_str::<serde_json::Value>(&text).unwrap_or_default();
-    summary["ending"] == "completed" && changed(run.summary_json()) >= changed(run.episodes_csv())
 }
 
 fn is_run(path: &Path) -> bool {

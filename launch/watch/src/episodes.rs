@@ -5,6 +5,8 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 
+use skein_protocol::files;
+
 /// Most bytes read at once, so that a long table needs no second copy in memory.
 const AT_ONCE: usize = 1 << 20;
 /// Bytes before the end of what was read that must not have changed: a resumed run cuts the table
@@ -43,11 +45,9 @@ impl Episodes {
     /// # Errors
     /// If the file cannot be read.
     pub(crate) fn update(&mut self, path: &Path) -> io::Result<()> {
-        let mut file = File::open(path)?;
+        // A pipe would be waited for.
+        let mut file = files::open(path, u64::MAX)?.into_inner();
         let metadata = file.metadata()?;
-        if !metadata.is_file() {
-            return Err(io::Error::other("it is not a regular file"));
-        }
         if metadata.ino() != self.inode || !self.continues(&mut file, metadata.len())? {
             *self = Self {
                 inode: metadata.ino(),
@@ -151,5 +151,15 @@ mod tests {
         let damaged = format!("{other}\u{0}\n1,2\n{}", row(2, 3));
         assert_eq!(steps(&damaged), [9, 8, 3]);
         assert_eq!(episodes.damaged, 2);
+    }
+
+    #[test]
+    fn a_pipe_in_the_tables_place_is_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("episodes.csv");
+        let made = std::process::Command::new("mkfifo").arg(&path).status();
+        assert!(made.unwrap().success());
+        let error = Episodes::default().update(&path).unwrap_err().to_string();
+        assert!(error.contains("not a regular file"), "{error}");
     }
 }

@@ -58,7 +58,12 @@ impl Events {
     /// If a file cannot be read. A folder that does not exist is empty.
     pub(crate) fn update(&mut self, folder: &Path) -> io::Result<()> {
         let mut files: Vec<_> = match fs::read_dir(folder) {
-            Ok(entries) => entries.flatten().map(|entry| entry.path()).collect(),
+            Ok(entries) => entries
+                .flatten()
+                // Links could lead out of the watched folder, and pipes would be waited for.
+                .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_file()))
+                .map(|entry| entry.path())
+                .collect(),
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
             Err(error) => return Err(error),
         };
@@ -83,8 +88,7 @@ impl Events {
     fn read_on(&mut self, path: &Path) -> io::Result<()> {
         let mut at = self.read.get(path).copied().unwrap_or(0);
         let mut file = File::open(path)?;
-        let metadata = file.metadata()?;
-        if !metadata.is_file() || metadata.len() == at {
+        if file.metadata()?.len() == at {
             return Ok(());
         }
         file.seek(SeekFrom::Start(at))?;
@@ -234,6 +238,22 @@ mod tests {
         assert_eq!(values(&two), [0.5, 0.25]);
         assert_eq!(values(&[&two[..], &[0xff; 40]].concat()), [0.5, 0.25]);
         assert_eq!(values(&frame(1, 1.5)), [1.5], "cut back");
+    }
+
+    #[test]
+    fn links_and_pipes_are_left_alone() {
+        let (folder, outside) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let elsewhere = outside.path().join("events");
+        fs::write(&elsewhere, frame(1, 0.5)).unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::os::unix::fs::symlink(elsewhere, at("link.tfevents.1")).unwrap();
+        let made = std::process::Command::new("mkfifo")
+            .arg(at("pipe.tfevents.2"))
+            .status();
+        assert!(made.unwrap().success());
+        let mut events = Events::default();
+        events.update(folder.path()).unwrap();
+        assert!(events.points("policy/temperature").is_empty());
     }
 
     #[test]
