@@ -309,7 +309,11 @@ impl<S: Storage> CheckpointStore<S> {
         for place in places {
             let loaded = self.load_from(&place);
             match loaded.and_then(|state| check(&state).map(|()| state)) {
-                Ok(state) => return Ok(Some(state)),
+                Ok(state) => {
+                    // A writer killed before it synced this name may have left it to a power cut.
+                    self.sync(&self.directory)?;
+                    return Ok(Some(state));
+                }
                 Err(error) if error.is_damage() => {
                     passed_over(&error);
                     newest = newest.or(Some(Box::new(error)));
