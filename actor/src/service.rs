@@ -22,9 +22,12 @@ use tracing::{debug, info, info_span, warn};
 
 use self::connection::LearnerConnection;
 use crate::recorder::Recorder;
+use crate::session::DisconnectReason;
 use skein_inference::Network;
 use skein_rollout::environment_loop::{EnvironmentLoop, EpisodeError};
 use skein_rollout::world::Worlds;
+
+pub use crate::session::ExitReason;
 
 /// Longest time between two tries to join a learner, and between two checks of the exit request
 /// meanwhile.
@@ -42,30 +45,6 @@ pub struct Service<'a> {
     last_heard: Instant,
     newest_learner: Option<LearnerIncarnation>,
     recorder: Option<Recorder>,
-}
-
-/// Reason why an actor exits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ExitReason {
-    /// The learner reported the end of the run.
-    Stopped,
-    /// This process received a signal, or has another reason of its own.
-    Signalled,
-    /// No learner of this run sent a heartbeat for `transport.learner_silence_secs`.
-    LearnerSilent,
-}
-
-/// Reason why an actor disconnects from a learner.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum DisconnectReason {
-    /// The actor exits.
-    Exit(ExitReason),
-    /// The learner is dead, or its next incarnation has begun.
-    LearnerGone,
-    /// This process was suspended for so long that the learner issued its tickets to others.
-    Suspended,
-    /// The learner receives none of this actor's records.
-    RejoinRequested,
 }
 
 impl<'a> Service<'a> {

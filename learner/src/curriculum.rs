@@ -13,7 +13,7 @@ use skein_protocol::ticket::{CourseChoice, Exploration, Ticket};
 use crate::checkpoint::EpochOrder;
 
 /// Number of epochs of the whole run; the last one may be shorter.
-pub(crate) fn epochs(config: &Config) -> u64 {
+pub fn epochs(config: &Config) -> u64 {
     config
         .run
         .episodes
@@ -23,12 +23,7 @@ pub(crate) fn epochs(config: &Config) -> u64 {
 /// Tickets of the epoch that `order` asks for, in episode order. With episodes flown in segments,
 /// an epoch is one episode, and `flown` holds the actions of its segments so far, from the reset
 /// on.
-pub(crate) fn training(
-    config: &Config,
-    run: RunId,
-    order: &EpochOrder,
-    flown: &[Action],
-) -> Vec<Ticket> {
+pub fn training(config: &Config, run: RunId, order: &EpochOrder, flown: &[Action]) -> Vec<Ticket> {
     let first = order.epoch * config.learning.episodes_per_epoch;
     let end = (first + config.learning.episodes_per_epoch).min(config.run.episodes);
     let ticket = |episode| Ticket {
@@ -53,7 +48,7 @@ pub(crate) fn training(
 ///
 /// Episode i has the same seed on every course and in every evaluation, so that snapshots are
 /// compared on the same starts. `evaluation` numbers the evaluations of a run.
-pub(crate) fn evaluation(
+pub fn evaluation(
     config: &Config,
     run: RunId,
     evaluation: u64,
@@ -80,7 +75,7 @@ pub(crate) fn evaluation(
 
 /// Tickets of the confirmation episodes for a candidate. Generated courses are the same for every
 /// candidate, and training never uses them.
-pub(crate) fn confirmation(
+pub fn confirmation(
     config: &Config,
     run: RunId,
     number: u64,

@@ -11,6 +11,7 @@
 mod candidates;
 mod curves;
 mod error;
+pub mod plan;
 mod saving;
 mod stop;
 #[cfg(test)]
@@ -35,7 +36,8 @@ use crate::curriculum;
 use crate::disk::Disk;
 use crate::episode::CommittedEpisode;
 use crate::episodes::ReceiverError;
-use crate::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
+use crate::episodes::exchange::EpisodeBatch;
+use crate::episodes::receiver::EpisodeReceiver;
 use crate::metrics::{Metrics, Scalar};
 use crate::report::Reporter;
 use crate::trainer::Trainer;
@@ -192,28 +194,23 @@ impl Training<'_> {
 
     /// Drops snapshots that no later episode needs.
     fn forget_snapshots(&mut self) {
-        let mut needed = vec![self.progress.version().0];
-        needed.extend(
-            self.in_flight
-                .iter()
-                .map(|epoch| epoch.order.policy_version),
-        );
-        needed.extend(self.progress.best.as_ref().map(|best| best.policy_version));
-        self.snapshots
-            .retain(|version, _| needed.contains(&version.0));
+        let (progress, in_flight) = (&self.progress, &self.in_flight);
+        self.snapshots.retain(|version, _| {
+            plan::is_needed(
+                *version,
+                progress,
+                in_flight.iter().map(|epoch| &epoch.order),
+            )
+        });
     }
 
     /// Orders the next epoch's episodes, if they are not ordered yet, with the newest snapshot.
     /// With policy lag 1, also those of the epoch after it: they are flown with the present
     /// snapshot while the next epoch is learned from.
     fn order_ahead(&mut self) -> Result<(), TrainingError> {
-        let end = self.progress.epochs + 1 + self.config.learning.policy_lag;
-        let end = end.min(curriculum::epochs(self.config));
-        let first = self
-            .in_flight
-            .back()
-            .map_or(self.progress.epochs, |last| last.order.epoch + 1);
-        for epoch in first..end {
+        let last_ordered = self.in_flight.back().map(|last| last.order.epoch);
+        let done = self.progress.epochs;
+        for epoch in plan::epochs_to_order(self.config, done, last_ordered) {
             self.order(self.next_order(epoch))?;
         }
         Ok(())

@@ -1,21 +1,19 @@
 //! Connection of an actor to its learner.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use skein_protocol::ids::{ActorId, ActorIncarnation};
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::status::{ActorState, ActorStatus, StatusRecord};
-use skein_protocol::ticket::{Control, Ticket};
+use skein_protocol::ticket::Ticket;
 use skein_protocol::transition::RecordKind;
 use skein_run::RunIdentity;
 use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_transport::{ActorPorts, LoanedTransition, ServiceError};
 use tracing::{debug, warn};
 
-use super::{DisconnectReason, ExitReason, Service};
-use crate::snapshot_cache::SnapshotCache;
+use super::Service;
+use crate::session::{DisconnectReason, Session};
 use skein_inference::Network;
 use skein_rollout::environment_loop::{Directive, RecordLink};
 
@@ -24,82 +22,41 @@ use skein_rollout::environment_loop::{Directive, RecordLink};
 pub(super) struct LearnerConnection<'a> {
     ports: ActorPorts,
     identity: &'a RunIdentity,
-    actor: ActorId,
-    incarnation: ActorIncarnation,
-    weights: SnapshotCache,
-    tickets: VecDeque<QueuedTicket>,
-    limits: ConnectionLimits,
+    session: Session,
     exit_requested: &'a dyn Fn() -> bool,
-    /// Detected reason to disconnect.
-    disconnect_reason: Option<DisconnectReason>,
-    last_heard: Instant,
-    /// Time of the last heartbeat sent; a long gap means that this process was suspended.
-    last_heartbeat: Instant,
     timer: LapTimer,
-    /// `true` once the learner was notified of the present idle time.
-    reported_idle: bool,
     pub(super) episodes_flown: u64,
-}
-
-struct QueuedTicket {
-    arrived: Instant,
-    ticket: Ticket,
-}
-
-/// Deadlines and limits, from the `[transport]` section.
-struct ConnectionLimits {
-    heartbeat: Duration,
-    ticket_lifetime: Duration,
-    actor_silence: Duration,
-    learner_silence: Duration,
-    tickets: usize,
 }
 
 impl<'a> LearnerConnection<'a> {
     /// Creates the connection over `ports`, for the current incarnation of `service`. It starts
     /// empty: nothing is kept from an earlier incarnation.
     pub(super) fn new(service: &Service<'a>, ports: ActorPorts) -> Self {
-        let transport = &service.config.transport;
         Self {
             ports,
             identity: service.identity,
-            actor: service.actor,
-            incarnation: service.incarnation,
-            weights: SnapshotCache::of_run(service.config),
-            tickets: VecDeque::new(),
-            limits: ConnectionLimits {
-                heartbeat: transport.heartbeat(),
-                ticket_lifetime: Duration::from_secs_f64(transport.episode_deadline_secs),
-                actor_silence: Duration::from_secs_f64(transport.actor_silence_secs),
-                learner_silence: Duration::from_secs_f64(transport.learner_silence_secs),
-                tickets: transport.tickets_per_actor,
-            },
+            session: Session::begin(
+                service.identity.run,
+                service.config,
+                (service.actor, service.incarnation),
+                service.last_heard,
+                Instant::now(),
+            ),
             exit_requested: service.exit_requested,
-            disconnect_reason: None,
-            last_heard: service.last_heard,
-            last_heartbeat: Instant::now(),
             timer: LapTimer::start(),
-            reported_idle: false,
             episodes_flown: 0,
         }
     }
 
     /// Returns the time of the learner's last heartbeat.
     pub(super) fn last_heard(&self) -> Instant {
-        self.last_heard
+        self.session.last_heard()
     }
 
     /// Returns the reason to disconnect, if there is one.
     pub(super) fn disconnect_reason(&self) -> Option<DisconnectReason> {
-        if self.disconnect_reason.is_some() {
-            self.disconnect_reason
-        } else if (self.exit_requested)() {
-            Some(DisconnectReason::Exit(ExitReason::Signalled))
-        } else if self.last_heard.elapsed() > self.limits.learner_silence {
-            Some(DisconnectReason::Exit(ExitReason::LearnerSilent))
-        } else {
-            None
-        }
+        self.session
+            .disconnect_reason(Instant::now(), self.exit_requested)
     }
 
     /// Receives all messages and snapshots, drops expired tickets, and sends a heartbeat if one is
@@ -111,47 +68,24 @@ impl<'a> LearnerConnection<'a> {
             match received {
                 Ok(snapshot) => {
                     debug!(version = %snapshot.version, "snapshot received");
-                    self.weights.insert(snapshot);
+                    self.session.on_snapshot(snapshot);
                 }
                 Err(error) => warn!(%error, "snapshot refused"),
             }
             self.timer.lap(Stage::TakeSnapshot, 1);
         }
-        let lifetime = self.limits.ticket_lifetime;
-        self.tickets.retain(|queued| {
-            let alive = queued.arrived.elapsed() < lifetime;
-            if !alive {
-                warn!(
-                    episode = %queued.ticket.episode,
-                    policy = %queued.ticket.policy_version,
-                    "ticket expired"
-                );
-            }
-            alive
-        });
+        self.session.on_time(Instant::now());
         Ok(())
     }
 
     fn listen_for_control(&mut self) -> Result<(), ServiceError> {
         while let Some(message) = self.ports.receive_control()? {
-            match message.read(self.ports.run()) {
-                Ok(control) => {
-                    self.last_heard = Instant::now();
-                    if message.is_for(self.actor, self.incarnation) {
-                        self.handle(control);
-                    }
-                }
-                Err(fault) => warn!(%fault, "control record refused"),
-            }
+            self.session.on_message(&message, Instant::now());
         }
-        let silence = self.last_heartbeat.elapsed();
-        if silence > self.limits.actor_silence {
-            self.disconnect_reason
-                .get_or_insert(DisconnectReason::Suspended);
-        } else if silence >= self.limits.heartbeat {
+        if self.session.is_heartbeat_due(Instant::now()) {
             self.check_learner();
             self.ports.maintain()?;
-            self.last_heartbeat = Instant::now();
+            self.session.has_beaten(Instant::now());
             self.report(ActorState::Serving)?;
         }
         Ok(())
@@ -162,69 +96,27 @@ impl<'a> LearnerConnection<'a> {
     fn check_learner(&mut self) {
         match self.identity.current_incarnation() {
             Ok(Some(present)) if present.incarnation == self.ports.incarnation() => {}
-            Ok(_) => {
-                self.disconnect_reason
-                    .get_or_insert(DisconnectReason::LearnerGone);
-            }
+            Ok(_) => self.session.learner_is_gone(),
             Err(error) => debug!(%error, "cannot check the learner"),
-        }
-    }
-
-    fn handle(&mut self, control: Control) {
-        match control {
-            Control::Heartbeat => {}
-            Control::Rejoin => {
-                self.disconnect_reason
-                    .get_or_insert(DisconnectReason::RejoinRequested);
-            }
-            Control::Stop => {
-                self.disconnect_reason = Some(DisconnectReason::Exit(ExitReason::Stopped))
-            }
-            Control::Fly(ticket) => {
-                // A reissued episode replaces its earlier ticket.
-                self.tickets
-                    .retain(|queued| queued.ticket.episode != ticket.episode);
-                if self.tickets.len() >= self.limits.tickets {
-                    warn!(
-                        episode = %ticket.episode,
-                        limit = self.limits.tickets,
-                        "more tickets than transport.tickets_per_actor; the oldest is dropped"
-                    );
-                    self.tickets.pop_front();
-                }
-                self.tickets.push_back(QueuedTicket {
-                    arrived: Instant::now(),
-                    ticket,
-                });
-            }
         }
     }
 
     /// Returns the first ticket whose snapshot is available, with its network.
     pub(super) fn take_ticket(&mut self) -> Option<(Ticket, Arc<Network>)> {
-        let ready = self
-            .tickets
-            .iter()
-            .position(|queued| self.weights.holds(queued.ticket.policy_version))?;
-        let ticket = self.tickets.remove(ready)?.ticket;
-        let network = self.weights.network(ticket.policy_version)?;
-        self.reported_idle = false;
+        let ticket = self.session.take_ticket()?;
+        let weights = self.session.weights_mut();
+        let network = weights.network(ticket.policy_version)?;
         self.timer.lap(Stage::TakeSnapshot, 0);
         Some((ticket, network))
     }
 
-    /// Waits for the learner, at most until the next heartbeat. Reports to the learner first: it
-    /// wakes actors only for what an idle one would miss.
+    /// Waits for the learner, at most until the next heartbeat.
     pub(super) fn wait(&mut self) -> Result<(), ServiceError> {
-        if !self.reported_idle {
-            self.reported_idle = true;
+        if self.session.begins_to_wait() {
             self.report(ActorState::Serving)?;
         }
-        if let Err(error) = self.ports.wait(
-            self.limits
-                .heartbeat
-                .saturating_sub(self.last_heartbeat.elapsed()),
-        ) {
+        let patience = self.session.patience(Instant::now());
+        if let Err(error) = self.ports.wait(patience) {
             // A lasting failure shows as silence, so there is no hurry.
             debug!(%error, "cannot wait for the learner");
             std::thread::sleep(Duration::from_millis(10));
@@ -241,12 +133,13 @@ impl<'a> LearnerConnection<'a> {
     /// Sends this actor's status. It does not count as a heartbeat, so that a suspension is still
     /// detected.
     pub(super) fn report(&self, state: ActorState) -> Result<(), ServiceError> {
+        let (actor, incarnation) = self.session.identity();
         let status = ActorStatus {
-            actor: self.actor,
-            incarnation: self.incarnation,
+            actor,
+            incarnation,
             pid: std::process::id(),
             state,
-            newest_policy: self.weights.newest(),
+            newest_policy: self.session.weights().newest(),
             episodes_flown: self.episodes_flown,
             times: *self.timer.times(),
         };

@@ -9,7 +9,8 @@ use std::time::{Duration, Instant};
 
 use skein_learner::episode::CommittedEpisode;
 use skein_learner::episodes::assembly::KeptData;
-use skein_learner::episodes::receiver::{EpisodeBatch, EpisodeReceiver};
+use skein_learner::episodes::exchange::EpisodeBatch;
+use skein_learner::episodes::receiver::EpisodeReceiver;
 use skein_learner::threads::cpu_secs;
 use skein_protocol::config::Config;
 use skein_protocol::ids::{Attempt, EpisodeId, Epoch, PolicyVersion};

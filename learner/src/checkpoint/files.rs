@@ -2,7 +2,6 @@
 
 use std::borrow::Cow;
 use std::collections::HashSet;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -10,11 +9,10 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView, View};
 use skein_protocol::ids::PolicyVersion;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::{IMAGE_HEIGHT, IMAGE_PIXELS, IMAGE_WIDTH};
-use skein_run::durable;
 use skein_run::fault::{FaultPoint, die_if_armed};
 
 use super::manifest::Manifest;
-use super::{CheckpointError, CheckpointState, TrainingProgress};
+use super::{CheckpointError, CheckpointState, Storage, TrainingProgress};
 use crate::replay::{ReplayState, RingState};
 use crate::state::{NamedTensor, TensorValues};
 
@@ -46,6 +44,7 @@ struct ProgressFile {
 
 /// Writes all files except the manifest into `directory`. `config`: the portable configuration.
 pub(super) fn write(
+    storage: &impl Storage,
     directory: &Path,
     state: &CheckpointState,
     config: &str,
@@ -55,9 +54,13 @@ pub(super) fn write(
         .iter()
         .map(|tensor| (tensor.name.clone(), BorrowedTensor::of(tensor)))
         .collect();
-    write_tensors(&directory.join(TENSORS), tensors)?;
+    write_tensors(storage, &directory.join(TENSORS), tensors)?;
     die_if_armed(FaultPoint::CheckpointTensors);
-    write_tensors(&directory.join(REPLAY), replay_tensors(&state.replay))?;
+    write_tensors(
+        storage,
+        &directory.join(REPLAY),
+        replay_tensors(&state.replay),
+    )?;
     die_if_armed(FaultPoint::CheckpointReplay);
     let snapshots = state
         .snapshots
@@ -69,7 +72,7 @@ pub(super) fn write(
             )
         })
         .collect();
-    write_tensors(&directory.join(SNAPSHOTS), snapshots)?;
+    write_tensors(storage, &directory.join(SNAPSHOTS), snapshots)?;
     let progress = ProgressFile {
         progress: state.progress.clone(),
         success_inserted: state.replay.success.inserted,
@@ -82,34 +85,39 @@ pub(super) fn write(
     };
     let bytes = bincode::serde::encode_to_vec(&progress, bincode::config::standard())
         .expect("progress consists of numbers, texts and lists of them");
-    write_bytes(&directory.join(PROGRESS), &bytes)?;
-    write_bytes(&directory.join(CONFIG), config.as_bytes())?;
+    write_bytes(storage, &directory.join(PROGRESS), &bytes)?;
+    write_bytes(storage, &directory.join(CONFIG), config.as_bytes())?;
     die_if_armed(FaultPoint::CheckpointProgress);
     Ok(())
 }
 
 /// Writes a file that only the user can read.
-pub(super) fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), CheckpointError> {
-    durable::create_private(path)
-        .and_then(|mut file| file.write_all(bytes))
-        .map_err(CheckpointError::io("write", path))
+pub(super) fn write_bytes(
+    storage: &impl Storage,
+    path: &Path,
+    bytes: &[u8],
+) -> Result<(), CheckpointError> {
+    let written = storage.write(path, bytes);
+    written.map_err(CheckpointError::io("write", path))
 }
 
 /// Reads the files that [`write`] wrote, each checked against `manifest`.
 pub(super) fn read(
+    storage: &impl Storage,
     directory: &Path,
     manifest: &Manifest,
 ) -> Result<CheckpointState, CheckpointError> {
     let path = directory.join(PROGRESS);
-    let bytes = manifest.read_file(directory, PROGRESS)?;
+    let bytes = manifest.read_file(storage, directory, PROGRESS)?;
     let file =
         parse_progress(&bytes).map_err(|problem| CheckpointError::Content { path, problem })?;
-    let replay = read_replay(&TensorFile::open(directory, REPLAY, manifest)?, &file)?;
+    let open = |name| TensorFile::open(storage, directory, name, manifest);
+    let replay = read_replay(&open(REPLAY)?, &file)?;
     Ok(CheckpointState {
         progress: file.progress,
-        tensors: read_tensors(&TensorFile::open(directory, TENSORS, manifest)?)?,
+        tensors: read_tensors(&open(TENSORS)?)?,
         replay,
-        snapshots: read_snapshots(&TensorFile::open(directory, SNAPSHOTS, manifest)?)?,
+        snapshots: read_snapshots(&open(SNAPSHOTS)?)?,
     })
 }
 
@@ -200,6 +208,7 @@ fn block_name(number: u64) -> String {
 }
 
 fn write_tensors(
+    storage: &impl Storage,
     path: &Path,
     tensors: Vec<(String, BorrowedTensor<'_>)>,
 ) -> Result<(), CheckpointError> {
@@ -211,13 +220,17 @@ fn write_tensors(
             problem,
         });
     }
-    safetensors::serialize_to_file(tensors, None, path).map_err(|error| match error {
-        safetensors::SafeTensorError::IoError(source) => CheckpointError::io("write", path)(source),
-        other => CheckpointError::Content {
-            path: path.to_owned(),
-            problem: other.to_string(),
-        },
-    })
+    storage
+        .write_tensors(path, tensors)
+        .map_err(|error| match error {
+            safetensors::SafeTensorError::IoError(source) => {
+                CheckpointError::io("write", path)(source)
+            }
+            other => CheckpointError::Content {
+                path: path.to_owned(),
+                problem: other.to_string(),
+            },
+        })
 }
 
 fn read_tensors(stored: &TensorFile) -> Result<Vec<NamedTensor>, CheckpointError> {
@@ -250,10 +263,15 @@ struct TensorFile {
 }
 
 impl TensorFile {
-    fn open(directory: &Path, name: &str, manifest: &Manifest) -> Result<Self, CheckpointError> {
+    fn open(
+        storage: &impl Storage,
+        directory: &Path,
+        name: &str,
+        manifest: &Manifest,
+    ) -> Result<Self, CheckpointError> {
         Ok(Self {
             path: directory.join(name),
-            bytes: manifest.read_file(directory, name)?,
+            bytes: manifest.read_file(storage, directory, name)?,
         })
     }
 

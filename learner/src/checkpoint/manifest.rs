@@ -4,10 +4,10 @@ use std::io::{self, BufReader};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
-use skein_protocol::files::{self, REPORT_BYTES};
+use skein_protocol::files::REPORT_BYTES;
 use xxhash_rust::xxh3::{Xxh3Default, xxh3_64};
 
-use super::CheckpointError;
+use super::{CheckpointError, Storage};
 
 /// Name of the manifest in the checkpoint's directory.
 pub(super) const NAME: &str = "manifest.json";
@@ -48,6 +48,7 @@ struct ManifestEntry {
 impl Manifest {
     /// Describes the files `names` in `directory`, as they are now.
     pub(super) fn of(
+        storage: &impl Storage,
         directory: &Path,
         names: &[&str],
         episodes: u64,
@@ -55,7 +56,7 @@ impl Manifest {
     ) -> Result<Self, CheckpointError> {
         let files = names
             .iter()
-            .map(|name| ManifestEntry::of(directory, name))
+            .map(|name| ManifestEntry::of(storage, directory, name))
             .collect::<Result<_, _>>()?;
         Ok(Self {
             format: FORMAT,
@@ -76,9 +77,10 @@ impl Manifest {
 
     /// Reads the manifest of the checkpoint in `directory`; checks that it is undamaged and has
     /// this format.
-    pub(super) fn read(directory: &Path) -> Result<Self, CheckpointError> {
+    pub(super) fn read(storage: &impl Storage, directory: &Path) -> Result<Self, CheckpointError> {
         let path = directory.join(NAME);
-        let bytes = files::read(&path, REPORT_BYTES).map_err(CheckpointError::io("read", &path))?;
+        let read = storage.read(&path, REPORT_BYTES);
+        let bytes = read.map_err(CheckpointError::io("read", &path))?;
         Self::parse(&bytes, &path)
     }
 
@@ -115,10 +117,14 @@ impl Manifest {
     }
 
     /// Checks that every file in `directory` is as it was written.
-    pub(super) fn verify(&self, directory: &Path) -> Result<(), CheckpointError> {
+    pub(super) fn verify(
+        &self,
+        storage: &impl Storage,
+        directory: &Path,
+    ) -> Result<(), CheckpointError> {
         for entry in &self.files {
             let path = directory.join(&entry.name);
-            let found = ManifestEntry::of(directory, &entry.name)?;
+            let found = ManifestEntry::of(storage, directory, &entry.name)?;
             entry.check(&path, found.bytes, &found.xxh3)?;
         }
         Ok(())
@@ -137,6 +143,7 @@ impl Manifest {
     /// Reads the file `name` in `directory`, and checks that it is as it was written.
     pub(super) fn read_file(
         &self,
+        storage: &impl Storage,
         directory: &Path,
         name: &str,
     ) -> Result<Vec<u8>, CheckpointError> {
@@ -149,7 +156,8 @@ impl Manifest {
                 problem: format!("it does not list {name}"),
             })?;
         let path = directory.join(name);
-        let content = files::read(&path, u64::MAX).map_err(CheckpointError::io("read", &path))?;
+        let read = storage.read(&path, u64::MAX);
+        let content = read.map_err(CheckpointError::io("read", &path))?;
         entry.check(&path, content.len() as u64, &hex(xxh3_64(&content)))?;
         Ok(content)
     }
@@ -157,11 +165,12 @@ impl Manifest {
 
 impl ManifestEntry {
     /// Describes the file `name` in `directory`, as it is now.
-    fn of(directory: &Path, name: &str) -> Result<Self, CheckpointError> {
+    fn of(storage: &impl Storage, directory: &Path, name: &str) -> Result<Self, CheckpointError> {
         let path = directory.join(name);
         // In pieces: depth images can be too large to hold twice in memory.
         let mut hasher = Xxh3Default::new();
-        let bytes = files::open(&path, u64::MAX)
+        let bytes = storage
+            .open(&path, u64::MAX)
             .and_then(|file| io::copy(&mut BufReader::with_capacity(PIECE, file), &mut hasher))
             .map_err(CheckpointError::io("read", &path))?;
         Ok(Self {

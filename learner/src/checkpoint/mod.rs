@@ -21,6 +21,7 @@
 mod error;
 mod files;
 mod manifest;
+mod storage;
 mod store;
 #[cfg(test)]
 mod tests;
@@ -39,6 +40,7 @@ use crate::spent::RunCosts;
 use crate::state::NamedTensor;
 
 pub use error::CheckpointError;
+pub use storage::{Files, Storage};
 pub use store::{CheckpointStore, checkpoint_directory};
 pub use writer::CheckpointWriter;
 

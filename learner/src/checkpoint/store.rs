@@ -6,25 +6,27 @@
 //! place. So there is always a sound checkpoint, once there is one.
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use skein_protocol::config::Config;
-use skein_run::durable;
 use skein_run::fault::{FaultPoint, die_if_armed};
 use tracing::warn;
 
 use super::manifest::{self, Manifest};
-use super::{CheckpointError, CheckpointState, files};
+use super::{CheckpointError, CheckpointState, Files, Storage, files};
 
 /// Suffix of a checkpoint that is about to be replaced by one of the same episode.
 const REPLACED: &str = ".replaced";
 
-/// The checkpoints of a run.
+/// The checkpoints of a run, in the system's files or another storage.
 #[derive(Debug, Clone)]
-pub struct CheckpointStore {
+pub struct CheckpointStore<S = Files> {
+    storage: S,
     directory: PathBuf,
     config: Config,
+    /// `config` as it is stored, and its digest.
+    portable: String,
+    digest: u64,
     keep: usize,
 }
 
@@ -44,9 +46,20 @@ impl CheckpointStore {
     /// Opens the checkpoints in `directory` of the run that `config` describes. As many of the
     /// newest sound ones are kept as `config` says.
     pub fn new(directory: &Path, config: &Config) -> Self {
+        Self::on(Files, directory, config)
+    }
+}
+
+impl<S: Storage> CheckpointStore<S> {
+    /// Like [`CheckpointStore::new`], in `storage`.
+    pub fn on(storage: S, directory: &Path, config: &Config) -> Self {
+        let portable = config.portable();
         Self {
+            storage,
             directory: directory.to_owned(),
             config: config.clone(),
+            digest: Config::digest_of(&portable),
+            portable,
             keep: config.checkpoints.keep.max(1),
         }
     }
@@ -72,16 +85,17 @@ impl CheckpointStore {
         let episodes = state.progress.episodes;
         // A single name, so that the leftovers of any interrupted write are removed by the next.
         let aside = self.directory.join(".writing");
-        remove(&aside)?;
+        self.remove(&aside)?;
         if let Err(error) = self.write_aside(&aside, state, relied_on) {
-            remove(&aside)?;
+            self.remove(&aside)?;
             return Err(error);
         }
         die_if_armed(FaultPoint::CheckpointSynced);
         let place = checkpoint_directory(&self.directory, episodes);
         self.make_way(&place)?;
-        fs::rename(&aside, &place).map_err(CheckpointError::io("rename into place", &aside))?;
-        sync(&self.directory)?;
+        let renamed = self.storage.rename(&aside, &place);
+        renamed.map_err(CheckpointError::io("rename into place", &aside))?;
+        self.sync(&self.directory)?;
         die_if_armed(FaultPoint::CheckpointRenamed);
         self.remove_others(episodes)?;
         Ok(place)
@@ -95,21 +109,21 @@ impl CheckpointStore {
     ) -> Result<(), CheckpointError> {
         // Not the run's own directory: a run that was removed does not come back as a folder.
         for folder in [&self.directory, aside] {
-            durable::create_private_directory(folder)
-                .map_err(CheckpointError::io("create", folder))?;
+            let created = self.storage.create_directory(folder);
+            created.map_err(CheckpointError::io("create", folder))?;
         }
         die_if_armed(FaultPoint::CheckpointCreated);
-        files::write(aside, state, &self.config.portable())?;
+        files::write(&self.storage, aside, state, &self.portable)?;
         self.seal(aside, state.progress.episodes)?;
         die_if_armed(FaultPoint::CheckpointManifest);
         for name in files::NAMES.iter().chain([&manifest::NAME]) {
-            sync(&aside.join(name))?;
+            self.sync(&aside.join(name))?;
         }
-        sync(aside)?;
+        self.sync(aside)?;
         // A new file's name lies in its folder, so the folder is synced too.
         let folders: BTreeSet<&Path> = relied_on.iter().filter_map(|path| path.parent()).collect();
         let mut all = relied_on.iter().map(PathBuf::as_path).chain(folders);
-        all.try_for_each(sync_once)
+        all.try_for_each(|path| self.sync_once(path))
     }
 
     /// Writes the manifest of the files in `directory` as they are now, which makes them a
@@ -118,8 +132,15 @@ impl CheckpointStore {
     /// # Errors
     /// [`CheckpointError::Io`] names the file.
     pub fn seal(&self, directory: &Path, episodes: u64) -> Result<(), CheckpointError> {
-        let manifest = Manifest::of(directory, &files::NAMES, episodes, self.config.digest())?;
+        let manifest = Manifest::of(
+            &self.storage,
+            directory,
+            &files::NAMES,
+            episodes,
+            self.digest,
+        )?;
         files::write_bytes(
+            &self.storage,
             &directory.join(manifest::NAME),
             manifest.to_text().as_bytes(),
         )
@@ -128,13 +149,14 @@ impl CheckpointStore {
     /// Renames a sound checkpoint at `place` to the name under which it is still found until the
     /// new one is in place.
     fn make_way(&self, place: &Path) -> Result<(), CheckpointError> {
-        if !is_sound(place) {
+        if !self.is_sound(place) {
             // The predecessor may still lie beside it; then that one stays.
             return self.retire(place);
         }
         let replaced = replaced(place);
         self.retire(&replaced)?;
-        fs::rename(place, replaced).map_err(CheckpointError::io("rename", place))
+        let renamed = self.storage.rename(place, &replaced);
+        renamed.map_err(CheckpointError::io("rename", place))
     }
 
     /// Lists the episodes with a checkpoint, the newest first. A folder that does not exist has
@@ -151,18 +173,13 @@ impl CheckpointStore {
     /// Lists all checkpoints, the newest first. Of two with one episode, the replacing one comes
     /// first.
     fn places(&self) -> Result<Vec<StoredCheckpoint>, CheckpointError> {
-        if !self.directory.exists() {
+        if !self.storage.exists(&self.directory) {
             return Ok(Vec::new());
         }
-        let io = || CheckpointError::io("list", &self.directory);
+        // A checkpoint is a directory; other entries are ignored.
+        let names = self.storage.directories(&self.directory);
         let mut found = Vec::new();
-        for entry in fs::read_dir(&self.directory).map_err(io())? {
-            let entry = entry.map_err(io())?;
-            // A checkpoint is a directory; other entries are ignored.
-            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-                continue;
-            }
-            let name = entry.file_name();
+        for name in names.map_err(CheckpointError::io("list", &self.directory))? {
             let episodes = name.to_str().and_then(|name| {
                 let number = name.strip_prefix("episode-")?;
                 number
@@ -199,13 +216,13 @@ impl CheckpointStore {
     }
 
     fn load_from(&self, place: &StoredCheckpoint) -> Result<CheckpointState, CheckpointError> {
-        let manifest = Manifest::read(&place.path)?;
-        let config = manifest.read_file(&place.path, files::CONFIG)?;
-        let shorter = match manifest.is_of(self.config.digest()) {
+        let manifest = Manifest::read(&self.storage, &place.path)?;
+        let config = manifest.read_file(&self.storage, &place.path, files::CONFIG)?;
+        let shorter = match manifest.is_of(self.digest) {
             true => None,
             false => Some(self.before_lengthening(&place.path, &config)?),
         };
-        let state = files::read(&place.path, &manifest)?;
+        let state = files::read(&self.storage, &place.path, &manifest)?;
         if let Some(end) = shorter {
             self.check_before_end(&state, end)?;
         }
@@ -292,7 +309,11 @@ impl CheckpointStore {
         for place in places {
             let loaded = self.load_from(&place);
             match loaded.and_then(|state| check(&state).map(|()| state)) {
-                Ok(state) => return Ok(Some(state)),
+                Ok(state) => {
+                    // A writer killed before it synced this name may have left it to a power cut.
+                    self.sync(&self.directory)?;
+                    return Ok(Some(state));
+                }
                 Err(error) if error.is_damage() => {
                     passed_over(&error);
                     newest = newest.or(Some(Box::new(error)));
@@ -324,7 +345,7 @@ impl CheckpointStore {
                 self.retire(&place.path)?;
                 continue;
             }
-            if is_sound(&place.path) {
+            if self.is_sound(&place.path) {
                 sound.insert(place.episodes);
             }
         }
@@ -333,27 +354,48 @@ impl CheckpointStore {
 
     /// Removes a checkpoint, if it exists. A half-removed one cannot be mistaken for a checkpoint.
     fn retire(&self, place: &Path) -> Result<(), CheckpointError> {
-        if !place.exists() {
+        if !self.storage.exists(place) {
             return Ok(());
         }
         let aside = self.directory.join(".removing");
-        remove(&aside)?;
-        fs::rename(place, &aside).map_err(CheckpointError::io("rename", place))?;
+        self.remove(&aside)?;
+        let renamed = self.storage.rename(place, &aside);
+        renamed.map_err(CheckpointError::io("rename", place))?;
         die_if_armed(FaultPoint::CheckpointRetired);
-        remove(&aside)
+        self.remove(&aside)
     }
-}
 
-/// `true` if there is a checkpoint at `place` whose files are all as they were written.
-fn is_sound(place: &Path) -> bool {
-    match Manifest::read(place).and_then(|manifest| manifest.verify(place)) {
-        Ok(()) => true,
-        Err(error) => {
-            if place.exists() {
-                warn!(%error, "a checkpoint is damaged");
+    /// `true` if there is a checkpoint at `place` whose files are all as they were written.
+    fn is_sound(&self, place: &Path) -> bool {
+        let manifest = Manifest::read(&self.storage, place);
+        match manifest.and_then(|manifest| manifest.verify(&self.storage, place)) {
+            Ok(()) => true,
+            Err(error) => {
+                if self.storage.exists(place) {
+                    warn!(%error, "a checkpoint is damaged");
+                }
+                false
             }
-            false
         }
+    }
+
+    fn remove(&self, path: &Path) -> Result<(), CheckpointError> {
+        let removed = self.storage.remove(path);
+        removed.map_err(CheckpointError::io("remove", path))
+    }
+
+    /// Syncs to disk a file that others wrote. After a failure the content may be lost, and a
+    /// second attempt may succeed without writing it. So this does not wait even for a full disk.
+    fn sync_once(&self, path: &Path) -> Result<(), CheckpointError> {
+        self.storage.sync(path).map_err(|error| {
+            CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string()))
+        })
+    }
+
+    /// Syncs a file or directory to disk.
+    fn sync(&self, path: &Path) -> Result<(), CheckpointError> {
+        let synced = self.storage.sync(path);
+        synced.map_err(CheckpointError::io("write to disk", path))
     }
 }
 
@@ -362,31 +404,4 @@ fn replaced(place: &Path) -> PathBuf {
     let mut name = place.as_os_str().to_owned();
     name.push(REPLACED);
     PathBuf::from(name)
-}
-
-fn remove(path: &Path) -> Result<(), CheckpointError> {
-    let removed = match fs::remove_dir_all(path) {
-        // A foreign file under one of our names is removed too.
-        Err(error) if error.kind() == std::io::ErrorKind::NotADirectory => fs::remove_file(path),
-        removed => removed,
-    };
-    match removed {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
-            Err(CheckpointError::io("remove", path)(error))
-        }
-        _ => Ok(()),
-    }
-}
-
-/// Syncs to disk a file that others wrote. After a failure the content may be lost, and a second
-/// attempt may succeed without writing it. So this does not wait even for a full disk.
-fn sync_once(path: &Path) -> Result<(), CheckpointError> {
-    durable::sync(path).map_err(|error| {
-        CheckpointError::io("write to disk", path)(std::io::Error::other(error.to_string()))
-    })
-}
-
-/// Syncs a file or directory to disk.
-fn sync(path: &Path) -> Result<(), CheckpointError> {
-    durable::sync(path).map_err(CheckpointError::io("write to disk", path))
 }

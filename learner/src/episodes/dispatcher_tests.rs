@@ -1,10 +1,7 @@
-//! Whatever happens to records and actors, every ordered episode is committed exactly once, whole,
-//! and as its ticket says.
-
-use std::collections::BTreeMap;
+//! Each loss has its remedy. The storms of `tests/storm/` test the whole: every ordered episode is
+//! committed exactly once and whole, whatever happens to records and actors.
 
 use bytemuck::Zeroable;
-use proptest::prelude::*;
 use skein_protocol::ActionSpace;
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::stages::Stage;
@@ -12,7 +9,6 @@ use skein_protocol::ticket::{Control, CourseChoice, Exploration};
 use skein_protocol::transition::{Outcome, RecordKind};
 
 use super::super::assembly::KeptData;
-use super::super::failures;
 use super::*;
 
 pub(super) const RUN: RunId = RunId(1);
@@ -413,114 +409,6 @@ fn actors_beyond_the_limit_get_no_tickets_until_there_is_room() {
         dispatcher.actors().collect::<Vec<_>>(),
         [ActorId(1), ActorId(2)]
     );
-}
-
-/// Possible next mishaps of one of three actors.
-#[derive(Debug, Clone, Copy)]
-enum Mishap {
-    FlyNext,
-    LoseRecord(usize),
-    RepeatRecord(usize),
-    Poison(usize),
-    DieMidway,
-    SkipTicket,
-    Restart,
-    Silence,
-}
-
-fn mishap() -> impl Strategy<Value = (u32, Mishap)> {
-    let kind = prop_oneof![
-        8 => Just(Mishap::FlyNext),
-        1 => (0..4_usize).prop_map(Mishap::LoseRecord),
-        1 => (0..4_usize).prop_map(Mishap::RepeatRecord),
-        1 => (0..4_usize).prop_map(Mishap::Poison),
-        1 => Just(Mishap::DieMidway),
-        1 => Just(Mishap::SkipTicket),
-        1 => Just(Mishap::Restart),
-        1 => Just(Mishap::Silence),
-    ];
-    (0..3_u32, kind)
-}
-
-proptest! {
-    /// Arbitrary mishaps followed by quiet: the promise still holds.
-    #[test]
-    fn every_order_is_committed_exactly_once_and_whole(
-        mishaps in prop::collection::vec(mishap(), 0..60),
-    ) {
-        const ORDERS: u64 = 12;
-        let mut now = Instant::now();
-        let mut dispatcher = Dispatcher::new(RUN, &limits(), LENGTHS);
-        (0..ORDERS).for_each(|episode| dispatcher.order(order(episode)));
-        let mut incarnations = [INCARNATION; 3];
-        let mut held: [VecDeque<Ticket>; 3] = Default::default();
-        let mut committed: BTreeMap<u64, CommittedEpisode> = BTreeMap::new();
-        // At `MOST_FAILURES` the episode would be given up, which another test covers.
-        let mut poisonings: BTreeMap<EpisodeId, usize> = BTreeMap::new();
-        let calm = (0..3 * ORDERS as usize).map(|turn| ((turn % 3) as u32, Mishap::FlyNext));
-        let quiet = calm.clone().chain([(0, Mishap::Silence)]).chain(calm);
-        for (actor, mishap) in mishaps.into_iter().chain(quiet) {
-            now += Duration::from_millis(100);
-            let index = actor as usize;
-            for (other, incarnation) in (0..3).zip(incarnations) {
-                attach(&mut dispatcher, other, incarnation, now);
-            }
-            let messages = dispatcher.issue(now);
-            for other in 0..3 {
-                held[other].extend(tickets_for(&messages, other as u32, incarnations[other]));
-            }
-            let next = held[index].front().cloned();
-            let mut sent = next
-                .map(|ticket| records(&ticket, actor, incarnations[index]))
-                .unwrap_or_default();
-            let (mut forget, mut restart) = (true, false);
-            match mishap {
-                Mishap::FlyNext => {}
-                Mishap::LoseRecord(at) if at < sent.len() => drop(sent.remove(at)),
-                Mishap::RepeatRecord(at) if at < sent.len() => sent.insert(at, sent[at]),
-                Mishap::Poison(at) if at < sent.len() => {
-                    let poisoned = poisonings.entry(EpisodeId(sent[at].episode)).or_default();
-                    *poisoned += 1;
-                    if *poisoned < failures::MOST_FAILURES {
-                        sent[at].reward = f32::NAN;
-                    }
-                }
-                Mishap::DieMidway => {
-                    sent.truncate(1);
-                    restart = true;
-                }
-                Mishap::SkipTicket => sent.clear(),
-                Mishap::Restart => {
-                    sent.clear();
-                    restart = true;
-                }
-                Mishap::Silence => {
-                    sent.clear();
-                    forget = false;
-                    now += Duration::from_secs(6);
-                    dispatcher.on_time(now);
-                    held.iter_mut().for_each(VecDeque::clear);
-                }
-                _ => sent.clear(),
-            }
-            for (place, episode) in feed(&mut dispatcher, &sent, now) {
-                prop_assert_eq!(place.index as u64, episode.episode.0);
-                prop_assert!(episode.check().is_ok());
-                prop_assert_eq!(episode.steps() as u64, 2 + episode.episode.0 % 3);
-                let earlier = committed.insert(episode.episode.0, episode);
-                prop_assert!(earlier.is_none(), "committed twice");
-            }
-            if forget {
-                held[index].pop_front();
-            }
-            if restart {
-                incarnations[index] = ActorIncarnation(incarnations[index].0 + 1);
-                held[index].clear();
-            }
-        }
-        prop_assert_eq!(committed.len() as u64, ORDERS);
-        prop_assert_eq!(dispatcher.open_orders(), 0);
-    }
 }
 
 #[test]

@@ -3,17 +3,19 @@
 //!
 //! [`dispatcher`] keeps the books: which actor holds which ticket, what has arrived for it, and
 //! what must be issued again. It is a state machine without clock or transport. [`assembly`] joins
-//! the records of one episode; [`order`] describes what was ordered. [`receiver`] is the thread
-//! that owns the transport and feeds the dispatcher; [`exchange`] is what it and the training
-//! thread exchange. [`situation`] says what is being waited for.
+//! the records of one episode; [`order`] describes what was ordered. [`server`] has the rounds of
+//! the receiving thread, which feed the dispatcher from the [`ports`]; they have no clock either.
+//! [`receiver`] is the thread around them, [`exchange`] what it and the training thread exchange.
+//! [`situation`] says what is being waited for.
 
 pub mod assembly;
 pub mod dispatcher;
-mod exchange;
+pub mod exchange;
 mod failures;
 pub mod order;
+pub mod ports;
 pub mod receiver;
-mod server;
+pub mod server;
 pub mod situation;
 
 pub use exchange::{ReceiverError, ReceiverState};

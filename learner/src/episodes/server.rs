@@ -6,9 +6,12 @@
 //! cannot be sent is tried again in the next round. At every heartbeat, the remains of dead actors
 //! are cleaned up. Only a transport that fails in every round for [`TRANSPORT_PATIENCE`] is given
 //! up.
+//!
+//! A round takes the time and the [`Ports`] from outside, so a simulation drives the same code as
+//! the thread.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::mpsc::{Receiver, Sender, TryRecvError};
+use std::sync::mpsc::{Sender, TryRecvError};
 use std::thread::sleep;
 use std::time::{Duration, Instant};
 
@@ -17,12 +20,12 @@ use skein_protocol::ids::RunId;
 use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::{LapTimer, Stage};
 use skein_protocol::ticket::{ControlMessage, ControlRecord};
-use skein_run::RunIdentity;
 use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_transport::{LearnerPorts, ServiceError};
 
 use super::dispatcher::{BatchPlace, Dispatcher, EpisodeOrder, HopelessEpisode};
-use super::exchange::{Command, ReceiverError, ReceiverState};
+use super::exchange::{Command, Inbox, ReceiverError};
+use super::ports::Ports;
 use crate::episode::CommittedEpisode;
 
 /// Time of failures in every round after which the transport is given up.
@@ -33,11 +36,12 @@ const RECORDS_AT_ONCE: usize = 1024;
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// State of the receiving thread.
-pub(super) struct Server {
+pub struct Server<P> {
     run: RunId,
     dispatcher: Dispatcher,
     deliveries: BTreeMap<u64, Delivery>,
-    ports: LearnerPorts,
+    ports: P,
+    inbox: Inbox,
     /// Messages and snapshots still to be sent, in this order.
     outbox: VecDeque<Outgoing>,
     /// `true` if something was sent and an actor that may be waiting was not woken yet.
@@ -73,22 +77,49 @@ enum Request {
     Vanish,
 }
 
-/// Work left after a round.
+/// Continuation after a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Next {
-    /// There may be more to take in.
+pub enum Next {
+    /// Another round at once: there may be more to take in.
     AtOnce,
-    /// Nothing until the next wake-up.
-    Wait,
+    /// Another round when something arrives, at the latest after this time.
+    Wait(Duration),
+    /// Nothing.
+    End,
 }
 
-impl Server {
-    pub(super) fn new(identity: &RunIdentity, config: &Config, ports: LearnerPorts) -> Self {
+impl Server<LearnerPorts> {
+    /// Serves until the finish command.
+    ///
+    /// # Errors
+    /// As [`Server::round`].
+    pub(super) fn run(&mut self) -> Result<(), ReceiverError> {
+        loop {
+            match self.round(Instant::now())? {
+                Next::AtOnce => {}
+                Next::Wait(patience) => self.wait(patience),
+                Next::End => return Ok(()),
+            }
+        }
+    }
+
+    fn wait(&mut self, patience: Duration) {
+        if self.trouble.unless(self.ports.wait(patience)).is_none() {
+            sleep(RETRY_INTERVAL);
+        }
+        self.timer.lap(Stage::ReceivingIdle, 1);
+    }
+}
+
+impl<P: Ports> Server<P> {
+    /// Starts without actors and orders, which come from `inbox`.
+    pub fn new(run: RunId, config: &Config, ports: P, inbox: Inbox) -> Self {
         Self {
-            run: identity.run,
-            dispatcher: Dispatcher::new(identity.run, &config.transport, config.record_lengths()),
+            run,
+            dispatcher: Dispatcher::new(run, &config.transport, config.record_lengths()),
             deliveries: BTreeMap::new(),
             ports,
+            inbox,
             outbox: VecDeque::new(),
             is_wake_due: false,
             heartbeat: config.transport.heartbeat(),
@@ -98,48 +129,42 @@ impl Server {
         }
     }
 
-    /// Serves until the finish command.
+    /// Does one round at `now`.
     ///
     /// # Errors
     /// [`ReceiverError::Hopeless`] and [`ReceiverError::Transport`].
-    pub(super) fn run(
-        &mut self,
-        inbox: &Receiver<Command>,
-        shared: &ReceiverState,
-    ) -> Result<(), ReceiverError> {
-        loop {
-            match self.take_commands(inbox) {
-                Request::Serve => {}
-                Request::Finish => {
-                    self.say_stop();
-                    return Ok(());
-                }
-                Request::Vanish => return Ok(()),
+    pub fn round(&mut self, now: Instant) -> Result<Next, ReceiverError> {
+        match self.take_commands() {
+            Request::Serve => {}
+            Request::Finish => {
+                self.say_stop();
+                return Ok(Next::End);
             }
-            let now = Instant::now();
-            self.take_status(now, shared);
-            self.timer.lap(Stage::HandOut, 0);
-            let next = self.take_records(now)?;
-            self.dispatcher.on_time(now);
-            self.hand_out(now);
-            self.send_heartbeat(now, shared);
-            self.send_out();
-            self.wake_actors();
-            shared.update(&self.dispatcher);
-            self.timer.lap(Stage::HandOut, 1);
-            if let Some(error) = self.trouble.lasting(now) {
-                return Err(ReceiverError::Transport(error));
-            }
-            if next == Next::Wait {
-                self.wait();
-            }
+            Request::Vanish => return Ok(Next::End),
         }
+        self.take_status(now);
+        self.timer.lap(Stage::HandOut, 0);
+        let may_be_more = self.take_records(now)?;
+        self.dispatcher.on_time(now);
+        self.hand_out(now);
+        self.send_heartbeat(now);
+        self.send_out();
+        self.wake_actors();
+        self.inbox.state.update(&self.dispatcher);
+        self.timer.lap(Stage::HandOut, 1);
+        if let Some(error) = self.trouble.lasting(now) {
+            return Err(ReceiverError::Transport(error));
+        }
+        Ok(match may_be_more {
+            true => Next::AtOnce,
+            false => Next::Wait(self.patience()),
+        })
     }
 
     /// Executes the training thread's commands; returns its final request.
-    fn take_commands(&mut self, inbox: &Receiver<Command>) -> Request {
+    fn take_commands(&mut self) -> Request {
         loop {
-            match inbox.try_recv() {
+            match self.inbox.next() {
                 Ok(Command::Publish(snapshot)) => {
                     self.outbox.push_back(Outgoing::Snapshot(snapshot))
                 }
@@ -173,7 +198,7 @@ impl Server {
         }
     }
 
-    fn take_status(&mut self, now: Instant, shared: &ReceiverState) {
+    fn take_status(&mut self, now: Instant) {
         let (mut heard, mut anyone_empty_handed) = (false, false);
         while let Some(record) = self.trouble.unless(self.ports.receive_status()).flatten() {
             heard = true;
@@ -189,7 +214,7 @@ impl Server {
             }
         }
         if heard {
-            self.share_times(shared);
+            self.share_times();
         }
         if anyone_empty_handed {
             // Not only at the next heartbeat: a new actor cannot fly before it has a snapshot.
@@ -198,21 +223,23 @@ impl Server {
         }
     }
 
-    fn share_times(&self, shared: &ReceiverState) {
+    fn share_times(&self) {
+        let shared = &self.inbox.state;
         shared.update_times(self.dispatcher.actor_times().plus(self.timer.times()));
     }
 
     /// Takes in records, and delivers the episodes that they complete.
-    fn take_records(&mut self, now: Instant) -> Result<Next, HopelessEpisode> {
+    /// Returns `true` if there may be more.
+    fn take_records(&mut self, now: Instant) -> Result<bool, HopelessEpisode> {
         let mut unbooked = 0;
-        let mut next = Next::AtOnce;
+        let mut may_be_more = true;
         for _ in 0..RECORDS_AT_ONCE {
             let Some(record) = self
                 .trouble
                 .unless(self.ports.receive_transition())
                 .flatten()
             else {
-                next = Next::Wait;
+                may_be_more = false;
                 break;
             };
             unbooked += 1;
@@ -226,7 +253,7 @@ impl Server {
             }
         }
         self.timer.lap(Stage::Assemble, unbooked);
-        Ok(next)
+        Ok(may_be_more)
     }
 
     /// Delivers the next episodes of the batch, and keeps early ones.
@@ -279,29 +306,27 @@ impl Server {
         }
     }
 
-    fn send_heartbeat(&mut self, now: Instant, shared: &ReceiverState) {
+    fn send_heartbeat(&mut self, now: Instant) {
         let last = self.last_heartbeat;
         if last.is_some_and(|last| now.duration_since(last) < self.heartbeat) {
             return;
         }
         self.last_heartbeat = Some(now);
-        shared.update_situation(self.dispatcher.situation(now), now);
-        self.share_times(shared);
+        let situation = self.dispatcher.situation(now);
+        self.inbox.state.update_situation(situation, now);
+        self.share_times();
         self.trouble.unless(self.ports.maintain());
         let heartbeat = ControlRecord::heartbeat(self.run);
         self.trouble.unless(self.ports.send_control(heartbeat));
     }
 
-    fn wait(&mut self) {
-        let patience = if self.outbox.is_empty() && !self.is_wake_due {
+    /// Longest time until the next round, if nothing arrives.
+    fn patience(&self) -> Duration {
+        if self.outbox.is_empty() && !self.is_wake_due {
             self.heartbeat
         } else {
             RETRY_INTERVAL
-        };
-        if self.trouble.unless(self.ports.wait(patience)).is_none() {
-            sleep(RETRY_INTERVAL);
         }
-        self.timer.lap(Stage::ReceivingIdle, 1);
     }
 
     fn say_stop(&mut self) {

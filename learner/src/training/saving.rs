@@ -17,6 +17,7 @@ use skein_protocol::summary::{RunEnding, RunSummary};
 use skein_run::fault::{FaultPoint, die_if_armed};
 use skein_run::{LearnerIncarnation, RunDirectory, RunIdentity, durable, save_snapshot};
 
+use super::plan::{self, Repetition};
 use super::{EpochCurves, StopMonitor, Training, TrainingError};
 use crate::checkpoint::{
     CheckpointError, CheckpointState, CheckpointStore, CheckpointWriter, TrainingProgress,
@@ -122,7 +123,8 @@ impl<'a> Training<'a> {
 
     /// Repeats what was published and ordered when the checkpoint was taken.
     fn restore_orders(&mut self) -> Result<(), TrainingError> {
-        let orders = std::mem::take(&mut self.progress.in_flight);
+        let repetitions: Vec<_> = plan::repetitions(&self.progress).collect();
+        self.progress.in_flight.clear();
         if let Some(episodes) = (self.progress.epochs > 0).then_some(self.progress.episodes) {
             tracing::info!(
                 episodes,
@@ -131,18 +133,19 @@ impl<'a> Training<'a> {
                 "resumed from a checkpoint"
             );
         }
-        // The present snapshot comes last, so that it is the newest for actors that attach now.
-        for order in &orders {
-            let version = PolicyVersion(order.policy_version);
-            if version < self.progress.version() {
-                let snapshot = self.kept_snapshot(version)?;
-                self.receiver.publish(snapshot)?;
+        for repetition in repetitions {
+            match repetition {
+                Repetition::Order(order) => self.order(order)?,
+                Repetition::Publish(present) if present == self.progress.version() => {
+                    self.publish()?
+                }
+                Repetition::Publish(older) => {
+                    let snapshot = self.kept_snapshot(older)?;
+                    self.receiver.publish(snapshot)?;
+                }
             }
         }
-        for order in orders {
-            self.order(order)?;
-        }
-        self.publish()
+        Ok(())
     }
 
     /// Cuts the result files back to the newest checkpoint. What came later will be computed
@@ -193,7 +196,7 @@ impl<'a> Training<'a> {
     }
 
     pub(super) fn checkpoint_if_due(&mut self) -> Result<(), TrainingError> {
-        if self.progress.episodes - self.saved.episodes >= self.config.checkpoints.every_episodes {
+        if plan::is_checkpoint_due(self.config, &self.progress, &self.saved) {
             self.checkpoint()?;
         }
         Ok(())
