@@ -3,12 +3,13 @@
     python train_sb3.py SNAPSHOT [STEPS] [PICTURE]
 
 SNAPSHOT gives the encoder, for example configs/snapshots/generalist.safetensors: SAC learns the
-policy alone, from codes and velocity. PICTURE is a .npy file of frames of one flight.
+policy alone, from codes and velocity. PICTURE is a .gif file of one flight of the result.
 """
 
 import sys
 
 import numpy as np
+from PIL import Image
 from stable_baselines3 import SAC
 
 import skein_rl
@@ -60,7 +61,8 @@ def main(snapshot, steps=20_000, picture=None):
     model.learn(int(steps), log_interval=40)
     print("after:  walls passed {:.2f}, arrived {:.2f}".format(*fly(model, env, 20)))
     if picture:
-        np.save(picture, frames(model, env, 1000))
+        first, *others = map(Image.fromarray, frames(model, env, 1000))
+        first.save(picture, save_all=True, append_images=others, duration=200, loop=0)
 
 
 if __name__ == "__main__":

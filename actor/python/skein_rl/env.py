@@ -124,7 +124,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         try:
             stepped, _ = fleet.step(actions_of(action, (len(self.action_names),)))
         except RuntimeError as error:
-            raise ResetNeeded(str(error)) from None
+            raise refusal(error) from None
         self._show()
         batch = self._batch(stepped)
         return (
@@ -141,7 +141,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         try:
             return np.array(self._open().oracle_actions()[0], dtype=np.float32)
         except RuntimeError as error:
-            raise ResetNeeded(str(error)) from None
+            raise refusal(error) from None
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """Returns an image from behind the drone with the depth image in a corner, uint8
@@ -191,13 +191,24 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         try:
             return render.frame(self._open(), 0, self._task)
         except RuntimeError as error:
-            raise ResetNeeded(str(error)) from None
+            raise refusal(error) from None
 
     def _show(self) -> None:
         if self.render_mode == "human":
             if self._window is None:
                 self._window = render.Window(self.metadata["render_fps"])
             self._window.show(self._frame())
+
+
+def refusal(error: RuntimeError, remedy: str = "") -> Exception:
+    """The exception for a call that the simulator could not do: no episode is in progress, or
+    another thread's call is. ``remedy`` is added to the first."""
+    # PyO3's words for an object that is in use.
+    if str(error).startswith("Already"):
+        return RuntimeError(
+            "another thread's call is in progress: give each thread an environment of its own"
+        )
+    return ResetNeeded(f"{error}{remedy}")
 
 
 def actions_of(actions: Any, shape: tuple[int, ...]) -> bytes:

@@ -34,8 +34,9 @@ class Policy:
 
     def __init__(self, path: str | os.PathLike[str], *, threads: int | None = None) -> None:
         self._path = os.fspath(path)
-        self._threads = len(os.sched_getaffinity(0)) if threads is None else int(threads)
-        self._core = _core.Policy(self._path, max(1, self._threads))
+        cores = len(os.sched_getaffinity(0))
+        self._threads = cores if threads is None else task.count("threads", threads)
+        self._core = _core.Policy(self._path, self._threads)
         self._seed = 0
 
     @classmethod
@@ -96,11 +97,14 @@ class Policy:
         """Forgets everything: ``n`` episodes begin.
 
         Args:
-            n: rows of later batches.
+            n: rows of later batches, 1 to 65,536.
             seed: of the noise of ``act(…, deterministic=False)``; row i draws as an actor with a
                 ticket of ``seed + i``, or of ``seed[i]``.
+
+        Raises:
+            ValueError: a number is out of bounds.
         """
-        several = isinstance(seed, Sequence)
+        n, several = task.count("n", n), isinstance(seed, Sequence)
         seeds = list(seed) if several else [int(seed) + row for row in range(n)]  # type: ignore[arg-type]
         self._core.reset([task.seed_of(one) for one in seeds])
 
@@ -131,6 +135,8 @@ class Policy:
         if "velocity" not in observation:
             raise KeyError("the observation has no \"velocity\": observe it, float32 [3]")
         velocity = np.asarray(observation["velocity"], dtype=np.float32)
+        if velocity.ndim not in (1, 2):
+            raise ValueError(f"velocity has the shape {velocity.shape}: give [3] or [n, 3]")
         single = velocity.ndim == 1
         rows = 1 if single else len(velocity)
         if self._core.count != rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict, Union
@@ -10,6 +11,10 @@ import numpy as np
 from gymnasium import spaces
 
 from . import _core
+
+# Most drones of a vector environment, and most rows of a policy's batch: a mistyped number must not
+# take the machine's memory.
+MOST_ROWS = 1 << 16
 
 Course = Union[str, "os.PathLike[str]", Mapping[str, Any]]
 
@@ -66,7 +71,7 @@ def build(keywords: Mapping[str, Any]) -> _core.Task:
     given = {key: value for key, value in keywords.items() if value is not None}
     defaults: dict[str, Any] = {"courses": "training", "levels": 1, "simulator": {}}
     if "config" in given:
-        defaults = _core.read_config(os.fspath(given["config"]))
+        defaults = _core.read_config(_file("config", given["config"]))
         if "courses" in given:
             del defaults["generated_share"]
     courses = _several(given.get("courses", defaults["courses"]))
@@ -82,7 +87,7 @@ def build(keywords: Mapping[str, Any]) -> _core.Task:
         [course if isinstance(course, Mapping) else _path(course) for course in named],
         float(share),
         [_level(level) for level in levels],
-        None if encoder is None else os.fspath(encoder),
+        None if encoder is None else _file("encoder", encoder),
     )
 
 
@@ -120,9 +125,21 @@ def action_space(task: _core.Task) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (len(task.action_names),), np.float32)
 
 
+def count(name: str, value: Any) -> int:
+    """Checks a number of drones, rows or threads."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise ValueError(f"{name} = {value!r} is no whole number")
+    if not 1 <= value <= MOST_ROWS:
+        raise ValueError(f"{name} = {value} is outside 1 to {MOST_ROWS}")
+    return int(value)
+
+
 def seed_of(seed: Any) -> int:
     """Checks a seed."""
-    number = int(seed)
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        raise TypeError(f"seed = {seed!r} is no whole number") from None
     if not 0 <= number < 1 << 64:
         raise ValueError(f"seed = {seed} is outside 0 to 2**64 - 1")
     return number
@@ -156,6 +173,13 @@ def _several(courses: Any) -> list[Any]:
         return list(courses)
     except TypeError:
         raise TypeError(f"courses = {courses!r} is neither a course nor a list of them") from None
+
+
+def _file(name: str, value: Any) -> str:
+    try:
+        return os.fsdecode(value)
+    except TypeError:
+        raise TypeError(f"{name} = {value!r} is no path: name a file") from None
 
 
 def _path(course: Any) -> Any:

@@ -8,14 +8,14 @@ from typing import Any, Optional
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
 from . import _core, render, task
 from .batch import Batch, arrays
-from .env import ARRAYS, INTEGERS, Observation, actions_of
+from .env import ARRAYS, INTEGERS, Observation, actions_of, refusal
 from .task import TaskKeywords
 
 
@@ -51,9 +51,10 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         }
         render.check_mode(render_mode, ["rgb_array"])
         self.render_mode = render_mode
-        self.num_envs = _count("num_envs", num_envs)
-        cores = len(os.sched_getaffinity(0))
-        self.threads = min(cores, self.num_envs) if threads is None else _count("threads", threads)
+        self.num_envs = task.count("num_envs", num_envs)
+        if threads is None:
+            threads = min(len(os.sched_getaffinity(0)), self.num_envs)
+        self.threads = task.count("threads", threads)
         self._keywords = dict(keywords)
         self._task = task.build(keywords)
         self._parts = task.observed(observation, self._task)
@@ -102,7 +103,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         try:
             block = fleet.reset(seeds, mask.tolist(), **wishes)
         except RuntimeError as error:
-            raise ResetNeeded(f"{error} without a reset_mask") from None
+            raise refusal(error, " without a reset_mask") from None
         self._seeded |= mask
         batch = arrays(block, self.num_envs, self._task)
         return self._observation(batch), _infos(batch, mask)
@@ -125,7 +126,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         try:
             block, lasts = fleet.step(actions_of(actions, (self.num_envs, len(self.action_names))))
         except RuntimeError as error:
-            raise ResetNeeded(str(error)) from None
+            raise refusal(error) from None
         batch = arrays(block, self.num_envs, self._task)
         infos = _infos(batch, np.ones(self.num_envs, dtype=np.bool_))
         if lasts:
@@ -143,7 +144,7 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         try:
             return np.array(self._open().oracle_actions(), dtype=np.float32)
         except RuntimeError as error:
-            raise ResetNeeded(str(error)) from None
+            raise refusal(error) from None
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
         """Returns an image of each environment, as ``CorridorEnv.render``."""
@@ -244,9 +245,3 @@ def _mask(mask: Any, count: int) -> npt.NDArray[np.bool_]:
     if not mask.any():
         raise ValueError("options: reset_mask is false everywhere: nothing would be reset")
     return mask
-
-
-def _count(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name} = {value!r} is no number from 1")
-    return int(value)

@@ -167,6 +167,9 @@ def main(calls, seed):
             elif kind == "render":
                 env.render()
             elif kind == "act":
+                if rng.random() < 0.1:
+                    policy.reset(odd(rng), seed=odd(rng))
+                    policy.reset()
                 policy.act(observe(rng), episode_start=rng.choice([None, True, odd(rng)]))
             elif kind == "raw":
                 raw(rng, env)

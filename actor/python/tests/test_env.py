@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 import warnings
 
 import gymnasium
@@ -213,6 +214,7 @@ def test_settings_come_from_keywords_and_files(tmp_path):
         ({"levels": []}, "levels"),
         ({"generated_share": 2}, "generated_share = 2"),
         ({"encoder": "none.safetensors"}, "none.safetensors"),
+        ({"encoder": 3}, "encoder = 3"),
         ({"config": "none.toml"}, "none.toml"),
         ({"observation": ["smell"]}, "smell"),
         ({"observation": []}, "observation"),
@@ -263,9 +265,34 @@ def test_the_order_of_calls_is_checked():
     for call in (env.reset, lambda: env.step(np.zeros(2)), env.oracle_action):
         with pytest.raises(ClosedEnvironmentError):
             call()
-    for seed in (-1, 1 << 64, "x"):
-        with pytest.raises((ValueError, gymnasium.error.Error)):
+    for seed in (-1, 1 << 64):
+        with pytest.raises(ValueError, match="seed"):
             skein_rl.CorridorEnv().reset(seed=seed)
+    for seed in ("x", 1.5):
+        with pytest.raises(TypeError, match="seed"):
+            skein_rl.CorridorEnv().reset(seed=seed)
+
+
+def test_a_second_thread_is_told_that_it_is_one():
+    vector = skein_rl.make_vec(16)
+    vector.reset(seed=1)
+    refused = []
+
+    def fly():
+        for _ in range(30):
+            try:
+                vector.step(np.zeros((16, 2)))
+            except Exception as error:
+                refused.append(error)
+
+    threads = [threading.Thread(target=fly) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert refused
+    assert all(type(error) is RuntimeError and "another thread" in str(error) for error in refused)
+    vector.step(np.zeros((16, 2)))
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -81,3 +81,37 @@ def test_torchrl_collects_a_batch():
     assert tuple(batch.batch_size) == (3, 40)
     assert batch["depth"].shape[-2:] == (72, 128)
     assert batch["next", "done"].any()
+
+
+def test_pufferlib_steps_it():
+    vector = pytest.importorskip("pufferlib.vector")
+    from pufferlib.emulation import GymnasiumPufferEnv
+
+    def make(buf=None, seed=0):
+        return GymnasiumPufferEnv(env_creator=skein_rl.CorridorEnv, buf=buf, seed=seed)
+
+    envs = vector.make(make, num_envs=3, backend=vector.Serial)
+    alone = [skein_rl.CorridorEnv() for _ in range(3)]
+    rows, _ = envs.reset(seed=5)
+    expected = [env.reset(seed=5 + place)[0] for place, env in enumerate(alone)]
+    over, ends = [False] * 3, 0
+    rng = np.random.default_rng(1)
+    for _ in range(40):
+        parts = rows.view(envs.driver_env.obs_dtype)
+        for place, observation in enumerate(expected):
+            for name, array in observation.items():
+                np.testing.assert_array_equal(parts[name][place, 0], array)
+        actions = rng.uniform(-1, 1, (3, 2)).astype(np.float32)
+        rows, rewards, terminated, truncated, _ = envs.step(actions)
+        for place, env in enumerate(alone):
+            # The step after an end only starts the next episode.
+            if over[place]:
+                expected[place], over[place] = env.reset()[0], False
+                continue
+            expected[place], reward, *ended, _ = env.step(actions[place])
+            assert rewards[place] == np.float32(reward)
+            assert [terminated[place], truncated[place]] == ended
+            over[place] = any(ended)
+            ends += any(ended)
+    assert ends > 0
+    envs.close()

@@ -71,6 +71,14 @@ def test_what_is_wrong_is_named(policy, env, tmp_path):
             policy.act({**observation, **change})
     with pytest.raises(ValueError, match="episode_start"):
         policy.act(observation, episode_start=[True, False])
+    with pytest.raises(ValueError, match="velocity"):
+        policy.act({**observation, "velocity": np.float32(1)})
+    for rows in (0, -1, 1.5, True, 10**12):
+        with pytest.raises(ValueError, match="n = "):
+            policy.reset(rows)
+    for threads in (0, "a", 1 << 70):
+        with pytest.raises(ValueError, match="threads = "):
+            skein_rl.Policy.load(policy._path, threads=threads)
     with pytest.raises(ValueError, match="none.safetensors"):
         skein_rl.Policy.load(tmp_path / "none.safetensors")
     (tmp_path / "bad.safetensors").write_bytes(b"abc" * 100)

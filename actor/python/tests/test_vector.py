@@ -101,7 +101,14 @@ def test_what_is_wrong_is_named():
     for mask in ([True] * 3, np.ones(2, bool), np.zeros(3, bool), np.ones(3)):
         with pytest.raises(ValueError, match="reset_mask"):
             env.reset(options={"reset_mask": mask})
-    for keywords in ({"num_envs": 0}, {"threads": 0}, {"autoreset_mode": "never"}):
+    # A number beyond the machine's memory is refused before anything is allocated.
+    for keywords in (
+        {"num_envs": 0},
+        {"num_envs": 10**12},
+        {"threads": 0},
+        {"threads": 1000},
+        {"autoreset_mode": "never"},
+    ):
         with pytest.raises(ValueError, match=next(iter(keywords))):
             skein_rl.CorridorVectorEnv(**keywords)
     env.close()
