@@ -414,7 +414,8 @@ fn many_actors_killed_at_any_moment_cost_no_slot_no_file_and_no_episode() {
     let stop = Arc::new(AtomicBool::new(false));
     let stop_request = Arc::clone(&stop);
     std::thread::spawn(move || {
-        sleep(PATIENCE);
+        // Tickets of the dead wait for their silence to be noticed: 15 to 20 s.
+        sleep(3 * PATIENCE);
         stop_request.store(true, Ordering::Relaxed);
     });
     let mut flown = Vec::new();
