@@ -104,11 +104,19 @@ impl TrainedEncoder {
             return Self::parse_file(&file).map_err(format);
         }
         let (snapshot, config) = Snapshot::parse(bytes, path)?;
-        let layout = SnapshotLayout::of(&config);
-        Ok(Self {
-            values: snapshot.values[layout.encoder()].to_vec(),
+        Ok(Self::of_snapshot(&snapshot, &config))
+    }
+
+    /// Returns the encoder of a snapshot with `config`.
+    ///
+    /// # Panics
+    /// If the snapshot has fewer values than `config` says.
+    pub fn of_snapshot(snapshot: &Snapshot, config: &Config) -> Self {
+        let encoder = SnapshotLayout::of(config).encoder();
+        Self {
+            values: snapshot.values[encoder].to_vec(),
             latent: config.vae.latent,
-        })
+        }
     }
 
     fn parse_file(file: &ParameterFile<'_>) -> Result<Self, String> {

@@ -41,16 +41,14 @@ pub(crate) fn draw(
     let course = entry.courses.of_episode(0)?;
     let latent = config.vae.latent;
     let codes = episode.records.iter().map(|at| &at.latent[..latent]);
-    let images: Option<Vec<_>> =
-        decoder.map(|decoder| codes.map(|code| decoder.decode(code)).collect());
-    let views = episode.records.iter().enumerate().map(|(number, record)| {
-        let numbers = CodeView::Numbers(&record.latent[..latent]);
-        let image = images
-            .as_ref()
-            .map(|images| CodeView::Image(&images[number]));
-        step(record, image.unwrap_or(numbers))
+    let decoded = |code| decoder.map(|decoder| decoder.decode(code));
+    let images: Vec<_> = codes.clone().map(decoded).collect();
+    let views = codes.zip(&images).map(|(code, image)| match image {
+        Some(image) => CodeView::Image(image),
+        None => CodeView::Numbers(code),
     });
-    let steps: Vec<_> = views.collect();
+    let steps = episode.records.iter().zip(views);
+    let steps: Vec<_> = steps.map(|(record, code)| step(record, code)).collect();
     Ok(draw_flight(&course, &steps, &entry.name, file)?)
 }
 

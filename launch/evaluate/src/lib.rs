@@ -29,7 +29,7 @@ use skein_protocol::decoder_file::{DECODER_FILE, TrainedDecoder};
 use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::files::destination;
-use skein_protocol::snapshot::{Snapshot, SnapshotLayout};
+use skein_protocol::snapshot::Snapshot;
 use skein_protocol::transition::RecordLengths;
 use skein_reports::{MOST_DRAWN, unfinished_picture};
 use skein_rollout::courses::Courses;
@@ -275,10 +275,7 @@ fn decoder(
         Some(run) => RunDirectory::new(run).decoder(),
         None => path.with_file_name(DECODER_FILE),
     };
-    let encoder = TrainedEncoder {
-        values: snapshot.values[SnapshotLayout::of(config).encoder()].to_vec(),
-        latent: config.vae.latent,
-    };
+    let encoder = TrainedEncoder::of_snapshot(snapshot, config);
     let trained = TrainedDecoder::of(&encoder.sha256(), &file)
         .context("this file is only for what latent codes hold: remove it to do without")?;
     Ok(trained.map(|trained| Decoder::new(Isa::best(), &trained)))
