@@ -133,10 +133,10 @@ impl ExperimentArguments {
             None => Some(ExperimentPlan::claim(root)?),
             Some(_) => None,
         };
-        let mut plan = ExperimentPlan::new(experiment, root, seeds)?;
-        if let Some(job) = &self.job {
-            plan.keep_only(job)?;
-        }
+        let mut plan = match &self.job {
+            None => ExperimentPlan::new(experiment, root, seeds),
+            Some(job) => ExperimentPlan::of_one(experiment, root, seeds, job),
+        }?;
         plan.check_idle()?;
         for (run, other) in plan.link_trained_runs()? {
             note!(

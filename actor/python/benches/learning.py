@@ -3,7 +3,8 @@
     python learning.py [--peers skein,sb3,cleanrl] [--seeds 1,2,3] [--steps 30000] [--threads 2]
                        [--skein PROGRAM]
 
-Task: ``Skein/Corridor-v0`` as it is, which is the training course from level 1. All three see the
+Task: ``Skein/Corridor-v0`` on its training course, with episodes that start at any of its five
+levels, so that each wall is met from the first episode on. All three see the
 latent code of one frozen encoder and the velocity left and up, 66 numbers. All have a policy of
 three and two critics of two hidden layers of 256, batches of 256, one update a step, the same
 rates and first temperature, and 300 random steps.
@@ -37,7 +38,7 @@ GOAL, WALLS, EPISODES, EVERY = 0.9, 5, 20, 1000
 CHECK_EPISODES, CHECK_SEED = 100, 5000
 POLICY, CRITIC, BATCH, WARMUP = [256] * 3, [256] * 2, 256, 300
 RATE, DISCOUNT, TRACKING, TEMPERATURE = 3e-4, 0.97, 0.005, 0.2
-LATENT, ACTORS = 64, 2
+LATENT, ACTORS, LEVELS = 64, 2, 5
 KEYWORDS = {"encoder": ENCODER, "observation": ["latent", "velocity"]}
 
 CONFIG = f"""
@@ -50,10 +51,11 @@ training = "{REPOSITORY}/configs/courses/training.toml"
 evaluation = ["{REPOSITORY}/configs/courses/training.toml"]
 [learning]
 observation = "latent+velocity"
-levels = 1
+levels = {LEVELS}
 warmup_steps = {WARMUP}
 updates_per_step = 1.0
-episodes_per_epoch = {ACTORS}
+episodes_per_epoch = EPOCH
+policy_lag = 1
 [sac]
 hidden_width = {POLICY[0]}
 critic_networks = 2
@@ -90,7 +92,8 @@ class Flat(gymnasium.ObservationWrapper):
     """The environment with observations as one vector."""
 
     def __init__(self):
-        super().__init__(gymnasium.make("Skein/Corridor-v0", **KEYWORDS))
+        levels = range(1, LEVELS + 1)
+        super().__init__(gymnasium.make("Skein/Corridor-v0", levels=levels, **KEYWORDS))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (LATENT + 2,), np.float32)
 
     def observation(self, observation):

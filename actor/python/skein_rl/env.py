@@ -203,8 +203,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
 def refusal(error: RuntimeError, remedy: str = "") -> Exception:
     """The exception for a call that the simulator could not do: no episode is in progress, or
     another thread's call is. ``remedy`` is added to the first."""
-    # PyO3's words for an object that is in use.
-    if str(error).startswith("Already"):
+    if task.in_use(error):
         return RuntimeError(
             "another thread's call is in progress: give each thread an environment of its own"
         )

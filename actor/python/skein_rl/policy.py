@@ -131,7 +131,20 @@ class Policy:
         Raises:
             KeyError: a part of the observation is missing.
             ValueError: a shape or a number is wrong.
+            RuntimeError: another thread's call is in progress; a policy remembers one flight.
         """
+        try:
+            return self._act(observation, episode_start, deterministic)
+        except RuntimeError as error:
+            if task.in_use(error):
+                raise RuntimeError(
+                    "another thread's call is in progress: give each thread a policy of its own"
+                ) from None
+            raise
+
+    def _act(
+        self, observation: Mapping[str, npt.NDArray[Any]], episode_start: Any, deterministic: bool
+    ) -> npt.NDArray[np.float32]:
         if "velocity" not in observation:
             raise KeyError("the observation has no \"velocity\": observe it, float32 [3]")
         velocity = np.asarray(observation["velocity"], dtype=np.float32)

@@ -212,3 +212,9 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
         if isinstance(merged[key], Mapping):
             merged[key] = dict(merged[key])
     return merged
+
+
+def in_use(error: RuntimeError) -> bool:
+    """Whether another thread's call of the same object is in progress."""
+    # PyO3's words for it.
+    return str(error).startswith("Already")

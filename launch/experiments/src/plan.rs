@@ -27,7 +27,7 @@ pub struct ExperimentPlan {
     pub root: PathBuf,
     /// Number of runs per arm.
     pub seeds: u64,
-    /// All runs.
+    /// All runs, or the one of a job.
     pub runs: Vec<PlannedRun>,
 }
 
@@ -127,44 +127,44 @@ impl ExperimentPlan {
     /// is ever removed or overwritten.
     pub fn new(experiment: &Experiment, root: &Path, seeds: u64) -> Result<Self, PlanError> {
         let root = std::path::absolute(root).map_err(io_at(root))?;
-        let mut plan = Self {
-            runs: Vec::new(),
-            root,
-            seeds,
-        };
-        let mut problems = Vec::new();
-        for seed in 1..=seeds {
-            for arm in 0..experiment.arms.len() {
-                let mut run = planned(experiment, &plan.root, arm, seed);
-                match run.look() {
-                    Ok(state) => run.state = state,
-                    Err(problem) => problems.push(problem),
-                }
-                plan.runs.push(run);
-            }
-        }
-        match problems.is_empty() {
-            true => Ok(plan),
-            false => Err(PlanError::Runs {
-                root: plan.root,
-                problems,
-            }),
-        }
+        Self::of(every_run(experiment, &root, seeds), root, seeds)
     }
 
-    /// Leaves only the run called `name`, `ARM/seed-N`.
+    /// The same for the run called `name`, `ARM/seed-N`, alone. It looks at no other run, because
+    /// other processes may be creating them.
     ///
     /// # Errors
-    /// [`PlanError::NoSuchRun`] names one that there is.
-    pub fn keep_only(&mut self, name: &str) -> Result<(), PlanError> {
-        let first = self.runs.first().map(|run| run.name.clone());
-        self.runs.retain(|run| run.name == name);
-        match self.runs.is_empty() {
+    /// As [`new`](Self::new), and [`PlanError::NoSuchRun`], which names one that there is.
+    pub fn of_one(
+        experiment: &Experiment,
+        root: &Path,
+        seeds: u64,
+        name: &str,
+    ) -> Result<Self, PlanError> {
+        let root = std::path::absolute(root).map_err(io_at(root))?;
+        let mut runs = every_run(experiment, &root, seeds);
+        let first = runs.first().map(|run| run.name.clone());
+        runs.retain(|run| run.name == name);
+        match runs.is_empty() {
             true => Err(PlanError::NoSuchRun {
                 name: name.to_owned(),
                 first: first.unwrap_or_default(),
             }),
-            false => Ok(()),
+            false => Self::of(runs, root, seeds),
+        }
+    }
+
+    fn of(mut runs: Vec<PlannedRun>, root: PathBuf, seeds: u64) -> Result<Self, PlanError> {
+        let mut problems = Vec::new();
+        for run in &mut runs {
+            match run.look() {
+                Ok(state) => run.state = state,
+                Err(problem) => problems.push(problem),
+            }
+        }
+        match problems.is_empty() {
+            true => Ok(Self { root, seeds, runs }),
+            false => Err(PlanError::Runs { root, problems }),
         }
     }
 
@@ -199,6 +199,15 @@ impl ExperimentPlan {
             Err(TryLockError::Error(error)) => Err(io_at(root)(error)),
         }
     }
+}
+
+/// Every run of the experiment, seed by seed, not looked at yet.
+fn every_run(experiment: &Experiment, root: &Path, seeds: u64) -> Vec<PlannedRun> {
+    let arms = 0..experiment.arms.len();
+    (1..=seeds)
+        .flat_map(|seed| arms.clone().map(move |arm| (arm, seed)))
+        .map(|(arm, seed)| planned(experiment, root, arm, seed))
+        .collect()
 }
 
 fn planned(experiment: &Experiment, root: &Path, number: usize, seed: u64) -> PlannedRun {
@@ -413,6 +422,12 @@ mod tests {
         for part in ["summary.json is damaged", "mv "] {
             assert!(error.contains(part), "{error}");
         }
+        // A job minds its own run alone, whatever others are about to create.
+        let job = |name: &str| ExperimentPlan::of_one(&experiment, &root, 2, name);
+        assert_eq!(job(&plan.runs[0].name).unwrap().runs.len(), 1);
+        assert!(job(&plan.runs[3].name).is_err());
+        let unknown = job("no-such").unwrap_err().to_string();
+        assert!(unknown.contains(&plan.runs[0].name), "{unknown}");
     }
 
     #[test]

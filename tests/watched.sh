@@ -1,0 +1,86 @@
+#!/usr/bin/env bash
+# Measures what being watched and being recorded cost a training.
+set -euo pipefail
+# shellcheck source=../launch/common.sh
+source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../launch/common.sh"
+
+help_if_asked -- "$@" <<END
+Usage: tests/watched.sh [ROUNDS]
+
+Trains 120 episodes of configs/generalist.toml in each way of ROUNDS rounds (4):
+
+  plain     as it is
+  watched   while a reader asks the page's server each second for all that the page shows
+  shown     while headless Chromium shows the page on the same machine, if it is installed
+  recorded  with every training episode recorded (run.record_every=1)
+
+Prints the wall seconds of each, then the median over the rounds of each way's time divided by the plain one's of its round. About
+half a minute a training on two cores, which should do nothing else. Every way must end with the same policy.
+
+Exit status: 0 all policies are equal, 1 something failed or differs, 2 wrong arguments.
+END
+[[ ${1-4} =~ ^[1-9][0-9]*$ && $# -le 1 ]] || {
+    echo "watched.sh: \"$*\" is no number of rounds: see tests/watched.sh --help" >&2
+    exit 2
+}
+
+# What a page that shows a run's curves, settings, actors and newest episodes asks for.
+read_page() {
+    local address=$1 run=$2 what
+    while true; do
+        for what in runs "run?run=$run" "curves?run=$run" "flights?run=$run" "recordings?run=$run"; do
+            curl -s -m 5 "$address/api/$what" >/dev/null || true
+        done
+        sleep 1
+    done
+}
+
+train() {
+    local run=$1 way=$2 settings=() watchers=() began ended address
+    [[ $way != recorded ]] || settings=(--set run.record_every=1)
+    if [[ $way == watched || $way == shown ]]; then
+        exec {page}< <(exec "$programs/skein-watch" "$runs" --port 0 --end-with-parent)
+        watchers=($!)
+        read -r -t 20 address <&"$page"
+        address=$(grep -o 'http://[0-9.:]*' <<<"$address")
+        if [[ $way == watched ]]; then
+            read_page "$address" "$run" &
+        else
+            chromium --headless=new --no-sandbox --disable-gpu --disable-background-networking --no-first-run \
+                --user-data-dir="$runs/.browser" --remote-debugging-port=0 "$address" >/dev/null 2>&1 &
+        fi
+        watchers+=($!)
+    fi
+    began=$EPOCHREALTIME
+    "$programs/skein" run --config "$repository/configs/generalist.toml" --run-dir "$runs/$run" --actors 1 \
+        --set run.episodes=120 --set evaluation.every_episodes=1000 --set evaluation.episodes=1 \
+        ${settings[@]+"${settings[@]}"} >"$runs/$run.log" 2>&1
+    ended=$EPOCHREALTIME
+    ((${#watchers[@]} == 0)) || { kill "${watchers[@]}" && exec {page}<&-; }
+    wait
+    awk -v way="$way" -v began="$began" -v ended="$ended" -v policy="$(policy_of "$run")" \
+        'BEGIN { printf "%-8s %6.2f s  policy %.16s\n", way, ended - began, policy }' | tee -a "$runs/times"
+}
+
+policy_of() {
+    sed -n 's/.*"policy_sha256": *"\([0-9a-f]*\)".*/\1/p' "$runs/$1/summary.json"
+}
+
+build_training
+build_watch
+programs=$(target_directory)/release
+runs=$(mktemp -d)
+trap 'kill $(jobs -p) 2>/dev/null || true; rm -rf "$runs"' EXIT
+ways=(plain watched shown recorded)
+command -v chromium >/dev/null || { echo "no chromium: the way \"shown\" is left out" && ways=(plain watched recorded); }
+for ((round = 1; round <= ${1-4}; round++)); do
+    for way in "${ways[@]}"; do
+        train "$way-$round" "$way"
+    done
+done
+echo "time beside plain, median of the rounds:"
+for way in "${ways[@]:1}"; do
+    awk -v way="$way" '$1 == "plain" { plain = $2 } $1 == way { print $2 / plain }' "$runs/times" |
+        sort -n | awk -v way="$way" '{ all[NR] = $1 } END { printf "%-8s %.3f\n", way, (all[int((NR + 1) / 2)] + all[int(NR / 2) + 1]) / 2 }'
+done
+[[ $(awk '{ print $NF }' "$runs/times" | sort -u | wc -l) == 1 ]] || { echo "watched.sh: the policies differ" >&2 && exit 1; }
