@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Measures what being watched and being recorded cost a training.
+# Measures what being watched and being recorded cost a training, and how the page bears many runs.
 set -euo pipefail
 # shellcheck source=../launch/common.sh
 source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/../launch/common.sh"
@@ -15,7 +15,8 @@ Trains 120 episodes of configs/generalist.toml in each way of ROUNDS rounds (4):
   recorded  with every training episode recorded (run.record_every=1)
 
 Prints the wall seconds of each, then the median over the rounds of each way's time divided by the plain one's of its round. About
-half a minute a training on two cores, which should do nothing else. Every way must end with the same policy.
+half a minute a training on two cores, which should do nothing else. Every way must end with the same policy. Then copies of a run,
+50 with 20,000 episodes and one with 1,000,000, are listed, described and drawn: seconds of each answer, and the server's memory.
 
 Exit status: 0 all policies are equal, 1 something failed or differs, 2 wrong arguments.
 END
@@ -28,21 +29,28 @@ END
 read_page() {
     local address=$1 run=$2 what
     while true; do
-        for what in runs "run?run=$run" "curves?run=$run" "flights?run=$run" "recordings?run=$run"; do
+        for what in runs "run?run=$run" "curves?curve=return&run=$run" "flights?run=$run" "recordings?run=$run"; do
             curl -s -m 5 "$address/api/$what" >/dev/null || true
         done
         sleep 1
     done
 }
 
+# Starts the page's server over a folder; leaves its process and address in $server and $address.
+serve() {
+    local line
+    exec {page}< <(exec "$programs/skein-watch" "$1" --port 0 --end-with-parent)
+    server=$!
+    read -r -t 20 line <&"$page"
+    address=$(grep -o 'http://[0-9.:]*' <<<"$line")
+}
+
 train() {
-    local run=$1 way=$2 settings=() watchers=() began ended address
+    local run=$1 way=$2 settings=() watchers=() began ended server address
     [[ $way != recorded ]] || settings=(--set run.record_every=1)
     if [[ $way == watched || $way == shown ]]; then
-        exec {page}< <(exec "$programs/skein-watch" "$runs" --port 0 --end-with-parent)
-        watchers=($!)
-        read -r -t 20 address <&"$page"
-        address=$(grep -o 'http://[0-9.:]*' <<<"$address")
+        serve "$runs"
+        watchers=("$server")
         if [[ $way == watched ]]; then
             read_page "$address" "$run" &
         else
@@ -66,6 +74,29 @@ policy_of() {
     sed -n 's/.*"policy_sha256": *"\([0-9a-f]*\)".*/\1/p' "$runs/$1/summary.json"
 }
 
+# Copies a run into another folder, its episodes repeated until there are so many.
+copy_run() {
+    local run=$1 copy=$2 episodes=$3
+    mkdir -p "$(dirname "$copy")" && cp -r "$run" "$copy"
+    awk -v episodes="$episodes" 'NR == 1 { print; next } { sub(/^[0-9]*/, ""); rows[NR - 2] = $0 }
+        END { for (row = 0; row < episodes; row++) print row rows[row % (NR - 1)] }' "$run/episodes.csv" >"$copy/episodes.csv"
+}
+
+bear_many() {
+    local many=$runs/many number what server address
+    for ((number = 1; number <= 50; number++)); do
+        copy_run "$runs/plain-1" "$many/run-$number" 20000
+    done
+    copy_run "$runs/plain-1" "$many/long" 1000000
+    serve "$many"
+    for what in runs runs run?run=long "curves?curve=return&run=long" "curves?curve=return&run=long"; do
+        printf '%-28s ' "$what"
+        curl -s -m 60 -o "$runs/answer" -w '%{time_total} s, %{size_download} bytes, status %{http_code}\n' "$address/api/$what"
+    done
+    awk '/VmHWM/ { printf "memory                       %.0f MB at most\n", $2 / 1000 }' "/proc/$server/status"
+    kill "$server" && exec {page}<&-
+}
+
 build_training
 build_watch
 programs=$(target_directory)/release
@@ -78,6 +109,7 @@ for ((round = 1; round <= ${1-4}; round++)); do
         train "$way-$round" "$way"
     done
 done
+bear_many
 echo "time beside plain, median of the rounds:"
 for way in "${ways[@]:1}"; do
     awk -v way="$way" '$1 == "plain" { plain = $2 } $1 == way { print $2 / plain }' "$runs/times" |

@@ -38,7 +38,7 @@ GOAL, WALLS, EPISODES, EVERY = 0.9, 5, 20, 1000
 CHECK_EPISODES, CHECK_SEED = 100, 5000
 POLICY, CRITIC, BATCH, WARMUP = [256] * 3, [256] * 2, 256, 300
 RATE, DISCOUNT, TRACKING, TEMPERATURE = 3e-4, 0.97, 0.005, 0.2
-LATENT, ACTORS, LEVELS = 64, 2, 5
+LATENT, LEVELS, ACTORS, EPOCH = 64, 5, 2, 10
 KEYWORDS = {"encoder": ENCODER, "observation": ["latent", "velocity"]}
 
 CONFIG = f"""
@@ -54,7 +54,7 @@ observation = "latent+velocity"
 levels = {LEVELS}
 warmup_steps = {WARMUP}
 updates_per_step = 1.0
-episodes_per_epoch = EPOCH
+episodes_per_epoch = {EPOCH}
 policy_lag = 1
 [sac]
 hidden_width = {POLICY[0]}

@@ -122,7 +122,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
         """
         fleet = self._open()
         try:
-            stepped, _ = fleet.step(actions_of(action, (len(self.action_names),)))
+            stepped, *_ = fleet.step(actions_of(action, (len(self.action_names),)))
         except RuntimeError as error:
             raise refusal(error) from None
         self._show()

@@ -124,13 +124,15 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
         """
         fleet = self._open()
         try:
-            block, lasts = fleet.step(actions_of(actions, (self.num_envs, len(self.action_names))))
+            block, ended, lasts = fleet.step(
+                actions_of(actions, (self.num_envs, len(self.action_names)))
+            )
         except RuntimeError as error:
             raise refusal(error) from None
         batch = arrays(block, self.num_envs, self._task)
         infos = _infos(batch, np.ones(self.num_envs, dtype=np.bool_))
-        if lasts:
-            self._add_lasts(infos, lasts)
+        if ended:
+            self._add_lasts(infos, ended, arrays(lasts, len(ended), self._task))
         return (
             self._observation(batch),
             batch["reward"],
@@ -190,19 +192,17 @@ class CorridorVectorEnv(VectorEnv[Observation, npt.NDArray[np.float32], npt.NDAr
     def _observation(self, batch: Batch) -> Observation:
         return {part: batch[part] for part in self._parts}
 
-    def _add_lasts(self, infos: dict[str, Any], lasts: Sequence[Any]) -> None:
+    def _add_lasts(self, infos: dict[str, Any], ended: Sequence[int], lasts: Batch) -> None:
         """Adds what SAME_STEP returns beside: ``final_obs`` and ``final_info``."""
         mask = np.zeros(self.num_envs, dtype=np.bool_)
+        mask[ended] = True
         final_obs = np.full(self.num_envs, None, dtype=object)
+        for row, index in enumerate(ended):
+            final_obs[index] = {part: lasts[part][row] for part in self._parts}
         final: dict[str, Any] = {}
-        for index, block in lasts:
-            mask[index] = True
-            batch = arrays(block, 1, self._task)
-            final_obs[index] = {part: batch[part][0] for part in self._parts}
-            for key, value in _values(batch).items():
-                if key not in final:
-                    final[key] = np.zeros((self.num_envs, *value.shape[1:]), dtype=value.dtype)
-                final[key][index] = value[0]
+        for key, value in _values(lasts).items():
+            final[key] = np.zeros((self.num_envs, *value.shape[1:]), dtype=value.dtype)
+            final[key][ended] = value
         infos["final_obs"], infos["_final_obs"] = final_obs, mask
         infos["final_info"] = {**final, **{f"_{key}": mask.copy() for key in final}}
         infos["_final_info"] = mask.copy()

@@ -64,11 +64,8 @@ type FlightState = (u64, u64, i64, u64, u8, Vec<Action>);
 /// A batch, and the ends of episodes that a step also reset, by environment.
 type Drawn<'py> = (Bound<'py, PyByteArray>, Vec<(usize, Last)>);
 
-/// A batch, and of each episode that ended in a step that also reset its index and last moment.
-type Stepped<'py> = (
-    Bound<'py, PyByteArray>,
-    Vec<(usize, Bound<'py, PyByteArray>)>,
-);
+/// A batch; the environments whose episode ended in a step that also reset; a batch of the ends.
+type Stepped<'py> = (Bound<'py, PyByteArray>, Vec<usize>, Bound<'py, PyByteArray>);
 
 #[pymethods]
 impl Fleet {
@@ -133,17 +130,17 @@ impl Fleet {
         let (stepped, lasts) = self.on_all(py, |index, environment, image| {
             advance(&task, environment, autoreset, actions[index], image)
         })?;
-        let last = |(index, (image, moment)): (usize, Last)| {
-            let of_one = batch(py, 1, |images| {
-                images[0] = *image;
-                Ok(vec![moment])
-            });
-            Ok((index, of_one?))
-        };
-        Ok((
-            stepped,
-            lasts.into_iter().map(last).collect::<PyResult<_>>()?,
-        ))
+        let (ended, lasts): (Vec<_>, Vec<Last>) = lasts.into_iter().unzip();
+        let lasts = batch(py, lasts.len(), |images| {
+            let drawn = images.iter_mut().zip(lasts);
+            Ok(drawn
+                .map(|(image, (seen, moment))| {
+                    *image = *seen;
+                    moment
+                })
+                .collect())
+        })?;
+        Ok((stepped, ended, lasts))
     }
 
     /// The oracle's actions, `[n, action]`.
