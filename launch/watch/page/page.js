@@ -486,9 +486,7 @@ const SHOWN = [["position_m", "position, m"], ["velocity_mps", "velocity, m/s"],
 
 function numbersTable(flight, step) {
   const { numbers } = flight.steps[step];
-  // Without a teacher, its actions are zero.
-  const isThere = (column) => numbers[column] && (column !== "oracle_action" || flight.steps.some((one) => (one.numbers[column] || []).some((value) => value !== 0)));
-  const rows = SHOWN.filter(([column]) => isThere(column)).map(([column, title]) => [title, numbers[column].map((value) => (value ?? NaN).toFixed(2)).join("  ")]);
+  const rows = SHOWN.filter(([column]) => numbers[column]).map(([column, title]) => [title, numbers[column].map((value) => (value ?? NaN).toFixed(2)).join("  ")]);
   return table(["at this step", ""], rows, [1]);
 }
 
