@@ -217,7 +217,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for note in shapes_trained_on(&config, &courses) {
         note!("{note}");
     }
-    let progress = Progress::new(evaluation.total());
+    let progress = Progress::new("episode", evaluation.total());
     let evaluated = evaluation.run_and_tell(&|flown| progress.tell(flown));
     progress.finish();
     let evaluated = evaluated?;
