@@ -5,7 +5,8 @@ Opens every view in light and dark, wide and narrow; drives it by keyboard; play
 folder RUNS has one. Fails on an error on the console, a request that fails, or a page wider than its window. With
 --follow, watches until the page calls RUN complete. Without Chromium it says so and ends with status 77.
 
-Needs: Chromium (Debian: apt install chromium), target/release/skein-watch (launch/watch.sh builds it).
+Needs: Chromium (Debian: apt install chromium), target/release/skein-watch (launch/watch.sh builds it; SKEIN_WATCH names
+another). tests/viewers.sh runs this with a run of its own.
 """
 
 import argparse
@@ -20,7 +21,7 @@ import tempfile
 import time
 from pathlib import Path
 
-WATCH = Path(__file__).resolve().parent.parent / "target/release/skein-watch"
+WATCH = os.environ.get("SKEIN_WATCH") or Path(__file__).resolve().parent.parent / "target/release/skein-watch"
 VIEWS = ["curves", "actors", "settings", "failures", "flights"]
 DEADLINE_SECS = 60
 WIDE, NARROW = (1280, 860), (390, 844)
@@ -195,7 +196,7 @@ def main():
     arguments = parser.parse_args()
     program = next(filter(None, map(shutil.which, ["chromium", "chromium-browser", "google-chrome"])), None)
     if program is None:
-        print("there is no Chromium here: the page is NOT tested")
+        print("there is no Chromium here (Debian: apt install chromium): the page is NOT tested")
         sys.exit(77)
     if arguments.shots:
         arguments.shots.mkdir(parents=True, exist_ok=True)

@@ -268,7 +268,7 @@ fn write(flown: &Flown, path: &Path, courses: &Courses, lengths: RecordLengths) 
         None,
     )
     .and_then(|mut recording| {
-        recording.add(&episode, &flown.records)?;
+        recording.add(&episode, flown.records.iter())?;
         recording.finish()
     })
     .and_then(|()| fs::rename(&unfinished, path));

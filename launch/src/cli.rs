@@ -4,6 +4,7 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand};
+use skein_evaluate::Pictures;
 use skein_run::failure::EXIT_WRONG_ARGUMENTS;
 use skein_run::terminal::quoted;
 use skein_run::{note, notes};
@@ -245,11 +246,20 @@ const REPORT_NOTES: &str = "\
 Exit status: 0 drawn, 1 a plot could not be drawn or the run not be read, 2 wrong arguments.";
 
 /// Draws the plots of a run again, from the files it left, and prints their paths.
+///
+/// With --failures or --gif, draws these instead: the run's best snapshot flies the final
+/// evaluation again, the same episodes, or a suite. `skein evaluate` has more to choose from.
 #[derive(Args)]
 pub(crate) struct ReportArguments {
     /// Directory of the run.
     #[arg(long, value_name = "DIR")]
     pub(crate) run: PathBuf,
+    #[command(flatten)]
+    pub(crate) pictures: Pictures,
+    /// With --failures or --gif: a suite file to fly instead of the run's evaluation courses.
+    /// Example: configs/evaluations/shapes.toml.
+    #[arg(long, value_name = "FILE", requires = "Pictures")]
+    pub(crate) suite: Option<PathBuf>,
 }
 
 /// Task of `skein run`.

@@ -344,6 +344,11 @@ fn hand_over(program: &str, script: &str, options: &[OsString]) -> anyhow::Resul
 }
 
 fn report(arguments: &ReportArguments) -> anyhow::Result<ExitCode> {
+    let pictures = &arguments.pictures;
+    if pictures.failures.is_some() || pictures.gif.is_some() {
+        skein_evaluate::draw(&arguments.run, arguments.suite.as_deref(), pictures)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let run = open(&arguments.run)?;
     let (_, config) = run.open()?;
     let plots = draw(&run, &config);

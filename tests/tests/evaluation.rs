@@ -14,6 +14,7 @@ use std::process::Command;
 use skein_protocol::config::Config;
 use skein_protocol::evaluation::EvaluationReport;
 use skein_protocol::snapshot::Snapshot;
+use skein_run::tables::evaluation_table;
 use skein_tests::{EndedRun, RunRecipe, program, repository, run_program};
 
 /// Evaluates with `arguments` and returns the report.
@@ -44,7 +45,31 @@ fn a_runs_snapshot_flies_later_as_it_flew_in_the_run() {
     let fewer = evaluate(folder.path(), &["--run", directory, "--episodes", "3"]);
     assert!(fewer.courses.iter().all(|course| course.episodes == 3));
 
+    a_report_draws_what_the_run_flew(&run, folder.path());
     a_recording_holds_every_step_of_every_episode(&run, 32, folder.path());
+}
+
+/// Asserts that `skein report` draws single episodes of the final evaluation, flown again.
+fn a_report_draws_what_the_run_flew(run: &EndedRun, folder: &Path) {
+    let pictures: [(&str, &[u8]); 2] = [("--failures", b"\x89PNG"), ("--gif", b"GIF89a")];
+    let files = pictures.map(|(option, _)| folder.join(option));
+    let path = |file: &Path| file.to_str().unwrap().to_owned();
+    let mut arguments = vec!["report".to_owned(), "--run".to_owned()];
+    arguments.push(path(run.directory.root()));
+    for ((option, _), file) in pictures.iter().zip(&files) {
+        arguments.extend([(*option).to_owned(), path(file)]);
+    }
+    let output = run_program("skein", &arguments);
+    assert_eq!(output.code, Some(0), "{}", output.stderr);
+    let table = evaluation_table(&run.evaluation(), usize::MAX);
+    assert!(
+        output.stdout.contains(table.trim_end()),
+        "{}",
+        output.stdout
+    );
+    for ((option, begins), file) in pictures.iter().zip(&files) {
+        assert!(fs::read(file).unwrap().starts_with(begins), "{option}");
+    }
 }
 
 #[test]

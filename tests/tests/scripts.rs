@@ -109,6 +109,7 @@ fn wrong_arguments_end_with_status_2_and_a_line_on_the_remedy() {
         "launch/peers.sh",
         "tests/bench.sh",
         "tests/fuzz.sh",
+        "tests/viewers.sh",
     ] {
         let shown = bash(&format!("{script} --nonsense; echo status $?"));
         let help = format!("see {script} --help");

@@ -21,6 +21,19 @@ _COLUMNS = ("course", "episode", "step", "closing", "depth", "velocity_mps", "ac
 
 
 @dataclass(frozen=True)
+class Solid:
+    """A wall, all obstacles of a world, or the corridor.
+
+    Attributes:
+        triangles_m: its surface, ``[n, 3, 3]``: corners in the world, metres.
+        outlines_m: lines that are drawn of it, ``[points, 3]`` each: a wall's opening.
+    """
+
+    triangles_m: npt.NDArray[np.float32]
+    outlines_m: list[npt.NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
 class Recording:
     """A recording: one row for each observation, the closing ones included.
 
@@ -29,12 +42,16 @@ class Recording:
         course_names: names that ``columns["course"]`` indexes.
         reward_term_names: names of the columns of ``reward_terms``.
         action_names: names of the columns of ``action`` and ``oracle_action``.
+        events: for each episode, rows of it and what happened there. Of an MCAP file alone.
+        scenes: for each episode, its walls and obstacles by name. Of an MCAP file alone.
     """
 
     columns: Columns = field(repr=False)
     course_names: list[str]
     reward_term_names: list[str]
     action_names: list[str]
+    events: list[list[tuple[int, str]]] = field(default_factory=list, repr=False)
+    scenes: list[dict[str, Solid]] = field(default_factory=list, repr=False)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self.columns[name]
@@ -100,12 +117,19 @@ class Run:
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:
-    """Reads a file that ``--record`` wrote.
+    """Reads a file that ``--record`` wrote, or ``recordings/*.mcap`` of a run.
+
+    A file ``.mcap`` needs ``pip install skein-rl[mcap]``. It has events and scenes too, and
+    ``columns["reconstruction"]`` if a decoder was there; it lacks ``oracle_action`` if no teacher
+    was asked.
 
     Raises:
+        ImportError: the packages that read MCAP are not installed.
         OSError: the file cannot be read.
         ValueError: it is no recording; the message names it and what is missing.
     """
+    if Path(path).suffix == ".mcap":
+        return _read_mcap(Path(path))
     try:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in file.files}
@@ -127,6 +151,79 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         if column.shape[:1] != (rows,):
             raise ValueError(f"{path} is damaged: {name} has {column.shape} for {rows} rows")
     return Recording(columns, names, terms, axes)
+
+
+def _read_mcap(path: Path) -> Recording:
+    try:
+        from mcap.reader import make_reader
+        from mcap_protobuf.decoder import DecoderFactory
+    except ImportError:
+        raise ImportError('reading MCAP needs its packages: pip install "skein-rl[mcap]"') from None
+    with path.open("rb") as file:
+        try:
+            return _from_messages(make_reader(file, decoder_factories=[DecoderFactory()]))
+        except Exception as error:
+            raise ValueError(f"{path} is no recording, or damaged: {error!r}") from error
+
+
+def _from_messages(reader: Any) -> Recording:
+    messages: dict[str, list[Any]] = {}
+    events: list[list[tuple[int, str]]] = []
+    scenes: list[dict[str, Solid]] = []
+    begin = 0
+    for _, channel, _, message in reader.iter_decoded_messages(log_time_order=False):
+        row = len(messages.get("/drone/step", ())) - 1
+        if channel.topic == "/scene" and message.deletions:
+            # It begins an episode; others are pieces of the trail.
+            begin = row + 1
+            scenes.append(_solids(message))
+            events.append([])
+        elif channel.topic == "/events":
+            events[-1].append((max(row - begin, 0), message.message))
+        messages.setdefault(channel.topic, []).append(message)
+    columns = _step_columns(messages["/drone/step"])
+    for name, topic in (("depth", "/camera/image"), ("reconstruction", "/camera/reconstruction")):
+        if images := [np.frombuffer(image.data, np.uint8) for image in messages.get(topic, ())]:
+            columns[name] = np.stack(images).reshape(-1, 72, 128)
+    lists = {found.name: found.metadata for found in reader.iter_metadata()}
+    names = {name: [texts[str(place)] for place in range(len(texts))] for name, texts in lists.items()}
+    return Recording(
+        columns, names["course_names"], names["reward_term_names"], names["action_names"], events, scenes
+    )
+
+
+def _step_columns(steps: list[Any]) -> Columns:
+    """Columns of the messages ``skein.Step``, with the types of the ``.npz``."""
+    columns: Columns = {}
+    for part in steps[0].DESCRIPTOR.fields:
+        kind = {part.TYPE_FLOAT: np.float32, part.TYPE_INT32: np.int32}.get(part.type, np.uint8)
+        values = [getattr(step, part.name) for step in steps]
+        if hasattr(values[0], "__len__"):
+            values = [list(value) for value in values]
+            width = max(map(len, values))
+            # No teacher was asked: in this episode, or ever.
+            values = [value or [0] * width for value in values]
+            if width == 0:
+                continue
+        columns[part.name] = np.array(values, dtype=kind)
+    return columns
+
+
+def _solids(scene: Any) -> dict[str, Solid]:
+    solids = {}
+    for entity in scene.entities:
+        if entity.frame_id == "world":
+            corners = [points for part in entity.triangles for points in _points(part.points)]
+            outlines = [_points(line.points) for line in entity.lines]
+            closed = [np.vstack([line, line[:1]]) if drawn.type == 1 else line
+                      for line, drawn in zip(outlines, entity.lines)]
+            triangles = np.array(corners, np.float32).reshape(-1, 3, 3)
+            solids[entity.id.split(":")[0]] = Solid(triangles, closed)
+    return solids
+
+
+def _points(points: Any) -> npt.NDArray[np.float32]:
+    return np.array([(point.x, point.y, point.z) for point in points], np.float32).reshape(-1, 3)
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:

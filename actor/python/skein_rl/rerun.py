@@ -1,7 +1,8 @@
 """Recordings in Rerun, as Rerun's own types: the drone and its way, the depth image as points in the
-world, actions, rewards and the latent code.
+world, velocity, actions, rewards and the latent code. A recording as MCAP has more to show: walls
+with their openings, obstacles, reconstructions, and what the drone hit.
 
->>> skein_rl.rerun.save(skein_rl.read_recording("episodes.npz"), "flights.rrd")
+>>> skein_rl.rerun.save(skein_rl.read_recording("flights.mcap"), "flights.rrd")
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .data import Columns, Recording
+from .data import Columns, Recording, Solid
 
 _HEIGHT, _WIDTH = 72, 128
 # As in the simulator's [camera] section.
@@ -22,6 +23,7 @@ _CAMERA = {"horizontal_fov_deg": 90.0, "range_m": 20.0, "mount_m": [0.2, 0.0, 0.
 _PERIOD_SECS = 0.5
 # The drone's width and height.
 _HALF_SIZE_M = [0.49, 0.49, 0.145]
+_WALL, _EDGE = [115, 128, 148, 190], [51, 56, 66]
 
 
 def save(
@@ -64,8 +66,14 @@ def log(
     stream.log("world/drone/body", rr.Boxes3D(half_sizes=[_HALF_SIZE_M]), static=True)
     _log_camera(rr, stream, settings)
     begin = 0.0
-    for episode in recording.episodes():
+    for number, episode in enumerate(recording.episodes()):
         secs = begin + period_secs * episode["step"].astype(float)
+        if recording.scenes:
+            stream.set_time("flight", duration=begin)
+            _log_scene(rr, stream, recording.scenes[number])
+        for row, event in recording.events[number] if recording.events else _events(episode):
+            stream.set_time("flight", duration=float(secs[row]))
+            stream.log("events", rr.TextLog(event))
         _log_episode(rr, stream, recording, episode, secs, settings["range_m"])
         begin = float(secs[-1]) + 2 * period_secs
 
@@ -81,22 +89,45 @@ def _log_camera(rr: ModuleType, stream: Any, settings: Mapping[str, Any]) -> Non
     stream.log("world/drone/camera/depth", pinhole, static=True)
 
 
+def _log_scene(rr: ModuleType, stream: Any, scene: Mapping[str, Solid]) -> None:
+    stream.log("world/course", rr.Clear(recursive=True))
+    for name, solid in scene.items():
+        path = f"world/course/{name.replace(' ', '_')}"
+        if len(solid.triangles_m):
+            corners = solid.triangles_m.reshape(-1, 3)
+            stream.log(f"{path}/surface", rr.Mesh3D(vertex_positions=corners, albedo_factor=_WALL))
+        if solid.outlines_m:
+            stream.log(f"{path}/outline", rr.LineStrips3D(solid.outlines_m, colors=[_EDGE]))
+
+
+def _events(episode: Columns) -> list[tuple[int, str]]:
+    """What the columns tell, where no events were recorded."""
+    passed = np.concatenate([[0], episode["walls_passed"].astype(int)])
+    events = [(0, f"episode {int(episode['episode'][0])} begins")]
+    events += [(int(row), f"passed wall {passed[row + 1]}") for row in np.flatnonzero(np.diff(passed) > 0)]
+    timed_out = episode["truncated"].any()
+    return [*events, (len(passed) - 2, "timed out" if timed_out else "collided or reached the end")]
+
+
 def _log_episode(
     rr: ModuleType, stream: Any, recording: Recording, episode: Columns, secs: Any, range_m: float
 ) -> None:
-    course = recording.course_names[int(episode["course"][0])]
-    stream.set_time("flight", duration=float(secs[0]))
-    stream.log("events", rr.TextLog(f"{course}, episode {int(episode['episode'][0])} begins"))
     positions = episode["position_m"]
     for row, now in enumerate(secs):
         stream.set_time("flight", duration=float(now))
         turned = rr.Quaternion(xyzw=episode["orientation"][row])
         stream.log("world/drone", rr.Transform3D(translation=positions[row], quaternion=turned))
+        velocity = episode["velocity_mps"][row]
+        stream.log("world/velocity", rr.Arrows3D(origins=[positions[row]], vectors=[velocity]))
+        for axis, value in zip(("forward", "left", "up"), velocity):
+            stream.log(f"velocity/{axis}", rr.Scalars(float(value)))
         stream.log("world/way", rr.LineStrips3D([positions[: row + 1]]))
         # 255 is the range or farther: no surface. Rerun leaves out a depth of 0.
         depth = episode["depth"][row].reshape(_HEIGHT, _WIDTH)
         metres = np.where(depth == 255, 0.0, depth / 255.0 * range_m).astype(np.float32)
         stream.log("world/drone/camera/depth", rr.DepthImage(metres, meter=1.0))
+        if "reconstruction" in episode:
+            stream.log("reconstruction", rr.Image(episode["reconstruction"][row]))
         stream.log("code", rr.BarChart(episode["latent"][row]))
         stream.log("reward/total", rr.Scalars(float(episode["reward"][row])))
         for name, value in zip(recording.reward_term_names, episode["reward_terms"][row]):
@@ -111,15 +142,26 @@ def _layout() -> Any:
 
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial3DView(origin="world", name="flight"),
             rrb.Vertical(
-                rrb.Spatial2DView(origin="world/drone/camera/depth", name="depth"),
+                rrb.Spatial3DView(origin="world", name="flight"),
+                rrb.TextLogView(origin="events", name="events"),
+                row_shares=[4, 1],
+            ),
+            rrb.Vertical(
+                rrb.Horizontal(
+                    rrb.Spatial2DView(origin="world/drone/camera/depth", name="depth"),
+                    rrb.Spatial2DView(origin="reconstruction", name="reconstruction"),
+                ),
                 rrb.TimeSeriesView(origin="reward", name="reward"),
+                rrb.TimeSeriesView(origin="velocity", name="velocity, m/s"),
                 rrb.TimeSeriesView(contents=["action/**", "oracle_action/**"], name="action, and the oracle's"),
                 rrb.BarChartView(origin="code", name="latent code"),
+                row_shares=[3, 2, 2, 2, 1],
             ),
-            column_shares=[2, 1],
+            column_shares=[3, 2],
         ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed"),
     )
 

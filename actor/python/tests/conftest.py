@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import subprocess
 
 import numpy as np
 import pytest
@@ -24,15 +25,25 @@ def policy(generalist):
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory, generalist):
-    """A recording that skein-evaluate wrote, if launch/python.sh found that program."""
+    """A recording that skein-evaluate wrote, of every shipped course."""
+    path = tmp_path_factory.mktemp("recording") / "episodes.npz"
+    return record(path, generalist, 2, sorted((CONFIGS / "courses").glob("*.toml")))
+
+
+@pytest.fixture(scope="session")
+def same_episode(tmp_path_factory, generalist):
+    """An episode recorded twice: as .npz and as .mcap."""
+    folder = tmp_path_factory.mktemp("same")
+    courses = [CONFIGS / "courses" / "training.toml"]
+    return [record(folder / name, generalist, 1, courses) for name in ("one.npz", "one.mcap")]
+
+
+def record(path, snapshot, episodes, courses):
+    """Records episodes on each of the courses, if launch/python.sh found skein-evaluate."""
     program = os.environ.get("SKEIN_EVALUATE")
     if not program:
         pytest.skip("SKEIN_EVALUATE names no program: launch/python.sh sets it once it is built")
-    import subprocess
-
-    path = tmp_path_factory.mktemp("recording") / "episodes.npz"
-    command = [*program.split(), "--snapshot", generalist, "--episodes", "2", "--record", path]
-    courses = sorted((CONFIGS / "courses").glob("*.toml"))
+    command = [*program.split(), "--snapshot", snapshot, "--episodes", str(episodes), "--record", path]
     for course in courses:
         command += ["--course", course]
     subprocess.run(command, check=True, capture_output=True)

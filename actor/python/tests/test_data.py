@@ -45,6 +45,26 @@ def test_a_real_recording_is_read(recording):
     assert read.reward_term_names == skein_rl.REWARD_TERMS
 
 
+def test_an_mcap_holds_every_value_of_the_npz(same_episode):
+    arrays, mcap = map(skein_rl.read_recording, same_episode)
+    for names in ("course_names", "reward_term_names", "action_names"):
+        assert getattr(arrays, names) == getattr(mcap, names)
+    assert mcap["reconstruction"].shape == mcap["depth"].shape
+    assert set(mcap.columns) == {*arrays.columns, "reconstruction"}
+    for name, column in arrays.columns.items():
+        assert (mcap[name].dtype, mcap[name].shape) == (column.dtype, column.shape), name
+        assert mcap[name].tobytes() == column.tobytes(), name
+    (scene,), (events,) = mcap.scenes, mcap.events
+    assert [name for name in scene if name.startswith("wall")] == [f"wall {n}" for n in range(1, 6)]
+    opening = scene["wall 2"].outlines_m[0]
+    assert len(scene["wall 2"].triangles_m) > 3 and (opening[0] == opening[-1]).all()
+    passed = mcap["walls_passed"].astype(int)
+    assert events[0] == (0, "training, episode 0 begins")
+    for row, event in events[1:-1]:
+        assert event == f"passed wall {passed[row]}" and passed[row - 1] == passed[row] - 1
+    assert events[-1] == (len(mcap) - 1, "reached the end")
+
+
 def test_a_recording_becomes_a_table(made):
     pytest.importorskip("pandas")
     table = skein_rl.read_recording(made).to_pandas()
@@ -73,6 +93,10 @@ def test_damaged_recordings_are_named(made, tmp_path):
         bad.write_bytes(content)
         with pytest.raises(ValueError, match="bad.npz"):
             skein_rl.read_recording(bad)
+    bad_mcap = tmp_path / "bad.mcap"
+    bad_mcap.write_bytes(b"\x89MCAP0\r\n and then nothing")
+    with pytest.raises(ValueError, match="bad.mcap"):
+        skein_rl.read_recording(bad_mcap)
     np.savez(bad, step=np.zeros(3))
     with pytest.raises(ValueError, match="no array"):
         skein_rl.read_recording(bad)

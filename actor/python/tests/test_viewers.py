@@ -79,11 +79,31 @@ def test_tensorboard_reads_the_settings_that_differ_from_the_defaults(run):
     assert "window/success_rate" in {info.name.tag for info in experiment.metric_infos}
 
 
-def test_rerun_takes_a_recording(recording, tmp_path):
+def rerun(*arguments):
+    """What the program of rerun-sdk prints; it fails where that fails."""
+    done = subprocess.run(["rerun", *arguments], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+def test_rerun_takes_a_recording_with_all_that_it_holds(same_episode, tmp_path):
     pytest.importorskip("rerun")
     import skein_rl.rerun
 
-    path = tmp_path / "flights.rrd"
-    skein_rl.rerun.save(skein_rl.read_recording(recording), path)
-    verified = subprocess.run(["rerun", "rrd", "verify", path], capture_output=True, text=True, timeout=120)
-    assert verified.returncode == 0, verified.stderr
+    everywhere = ["world/drone/camera/depth", "velocity/forward", "reward/level_up", "oracle_action/left", "events"]
+    for path, more in zip(same_episode, ([], ["world/course/wall_1/surface", "reconstruction"])):
+        flights = tmp_path / f"{path.suffix[1:]}.rrd"
+        skein_rl.rerun.save(skein_rl.read_recording(path), flights)
+        rerun("rrd", "verify", flights)
+        stored = rerun("rrd", "print", "-v", flights)
+        for entity in [*everywhere, *more]:
+            assert f"/{entity}" in stored, entity
+
+
+def test_rerun_takes_an_mcap_as_it_is(same_episode, tmp_path):
+    pytest.importorskip("rerun")
+    _, mcap = same_episode
+    rerun("mcap", "check", mcap)
+    converted = tmp_path / "converted.rrd"
+    rerun("mcap", "convert", mcap, "--output", converted)
+    rerun("rrd", "verify", converted)

@@ -170,24 +170,32 @@ impl<'a> Recording<'a> {
         Ok(recording)
     }
 
-    /// Adds an episode: its steps, then its closing record.
+    /// Adds an episode: its steps, then its closing record. The action of a teacher or oracle is
+    /// left out if none was asked.
     ///
     /// # Errors
     /// Of the file.
     pub fn add<'r>(
         &mut self,
         episode: &Episode<'_>,
-        records: impl IntoIterator<Item = &'r TransitionRecord>,
+        records: impl Iterator<Item = &'r TransitionRecord> + Clone,
     ) -> io::Result<()> {
         let (course, number) = episode.course;
         self.begin_episode(episode.title, course)?;
+        let is_asked =
+            |record: &TransitionRecord| record.teacher_action.iter().any(|&it| it != 0.0);
+        let missing = match records.clone().any(is_asked) {
+            true => None,
+            false => Some("oracle_action"),
+        };
         for record in records {
-            self.write_step(&RecordingRow {
+            let row = RecordingRow {
                 course: number,
                 episode: episode.number,
                 lengths: episode.lengths,
                 record,
-            })?;
+            };
+            self.write_step(&row, missing)?;
         }
         self.end_episode(&episode.score)
     }
@@ -213,7 +221,7 @@ impl<'a> Recording<'a> {
         self.log(Level::Info, format!("{title} begins"))
     }
 
-    fn write_step(&mut self, row: &RecordingRow<'_>) -> io::Result<()> {
+    fn write_step(&mut self, row: &RecordingRow<'_>, missing: Option<&str>) -> io::Result<()> {
         let record = row.record;
         let secs = f64::from(record.step) * f64::from(self.settings.vehicle.control_period_secs);
         self.now = Timestamp::from_secs(self.begin_secs + secs);
@@ -233,7 +241,7 @@ impl<'a> Recording<'a> {
             let image = RawImage::of_depth(&image, self.now);
             self.send(Topic::Reconstruction, &image)?;
         }
-        self.send_bytes(Topic::Step, &encode_step(row))?;
+        self.send_bytes(Topic::Step, &encode_step(row, missing))?;
         self.send_bytes(Topic::Reward, &encode_reward(record))?;
         let before_m = self.before_m.replace(record.position_m);
         if let Some(before_m) = before_m {

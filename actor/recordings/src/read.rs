@@ -275,6 +275,7 @@ mod tests {
                 record.position_m = [f32::from(step), f32::from(number), 3.0];
                 record.depth.fill(10 * number + step);
                 record.reward = 0.25;
+                record.teacher_action[2] = f32::from(number);
                 record
             });
             let records: Vec<_> = records.collect();
@@ -331,6 +332,9 @@ mod tests {
         assert_eq!(numbers["reward"], [0.25]);
         assert_eq!(numbers["latent"].len(), 8);
         assert_eq!(numbers["step"], [2.0]);
+        assert_eq!(numbers["oracle_action"], [0.0, 0.0, 1.0]);
+        // No oracle was asked there.
+        assert!(!flights[0].steps[2].numbers.contains_key("oracle_action"));
         assert!(second.steps[0].secs == 0.0 && second.steps[2].secs > second.steps[1].secs);
         let (_, last) = second.events.last().unwrap();
         assert_eq!(last, "hit wall 1");

@@ -59,12 +59,13 @@ pub(crate) fn reward() -> Schema {
     own("skein.Reward", "Reward", fields.collect())
 }
 
-/// Returns an observation in Protobuf's encoding: a field for each column but the image.
-pub(crate) fn encode_step(row: &RecordingRow<'_>) -> Vec<u8> {
+/// Returns an observation in Protobuf's encoding: a field for each column but the image and the one
+/// that is `missing`.
+pub(crate) fn encode_step(row: &RecordingRow<'_>, missing: Option<&str>) -> Vec<u8> {
     let mut message = Vec::new();
     let mut bytes = Vec::new();
     for (number, column) in (1..).zip(&COLUMNS) {
-        let Some(encoding) = Encoding::of(column) else {
+        let Some(encoding) = Encoding::of(column).filter(|_| missing != Some(column.name)) else {
             continue;
         };
         bytes.clear();

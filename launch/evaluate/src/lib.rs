@@ -91,20 +91,27 @@ pub struct Arguments {
     /// and its walls from the front. Of an entry with several courses, the first is drawn.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
-    /// Also draw the episodes that failed to this file, as PNG, and print how the approaches to the
+    #[command(flatten)]
+    pictures: Pictures,
+    // Not a doc comment, which cannot contain the constant.
+    #[arg(long, value_name = "N", help = threads_help())]
+    threads: Option<NonZeroUsize>,
+}
+
+/// Pictures of single episodes.
+#[derive(Debug, Clone, Args)]
+pub struct Pictures {
+    /// Draw the episodes that failed to this file, as PNG, and print how the approaches to the
     /// walls ended: by shape of the opening, its clearance and its offset.
     ///
     /// The picture shows the wall with its opening, the last two metres, and the depth image a
     /// second before the end. What happened most often comes first.
     #[arg(long, value_name = "FILE")]
-    failures: Option<PathBuf>,
-    /// Also draw the first episode to this file as it flies, as GIF: from above, from the side,
+    pub failures: Option<PathBuf>,
+    /// Draw the first episode to this file as it flies, as GIF: from above, from the side,
     /// its depth image, and what the latent code keeps of it. Five times as fast as flown.
     #[arg(long, value_name = "FILE")]
-    gif: Option<PathBuf>,
-    // Not a doc comment, which cannot contain the constant.
-    #[arg(long, value_name = "N", help = threads_help())]
-    threads: Option<NonZeroUsize>,
+    pub gif: Option<PathBuf>,
 }
 
 /// Snapshot to fly.
@@ -118,6 +125,29 @@ struct Subject {
     /// A snapshot file (.safetensors).
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
+}
+
+/// Flies the final evaluation of a run again, or `suite`, and draws `pictures` of it. For a moving
+/// picture alone, one episode of each course is flown.
+///
+/// # Errors
+/// As for [`run`].
+pub fn draw(run: &Path, suite: Option<&Path>, pictures: &Pictures) -> anyhow::Result<()> {
+    self::run(&Arguments {
+        subject: Subject {
+            run: Some(run.to_owned()),
+            snapshot: None,
+        },
+        course: Vec::new(),
+        suite: suite.map(Path::to_owned),
+        episodes: pictures.failures.is_none().then_some(1),
+        overrides: Vec::new(),
+        json: None,
+        record: None,
+        plot: None,
+        pictures: pictures.clone(),
+        threads: None,
+    })
 }
 
 /// Flies what `arguments` ask for, prints the table and writes the files.
@@ -134,7 +164,8 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_folder(file)?;
         check_recordable(file)?;
     }
-    let pictures = [&arguments.plot, &arguments.failures, &arguments.gif];
+    let Pictures { failures, gif } = &arguments.pictures;
+    let pictures = [&arguments.plot, failures, gif];
     for file in pictures.into_iter().flatten() {
         check_plottable(file)?;
     }
@@ -163,7 +194,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_recording(episodes, courses.most_records(), free_memory())?;
     }
     let recording = arguments.record.as_deref();
-    let decoder = match recording.is_some_and(is_mcap) || arguments.gif.is_some() {
+    let decoder = match recording.is_some_and(is_mcap) || gif.is_some() {
         true => decoder(&arguments.subject, &path, &snapshot, &config)?,
         false => None,
     };
@@ -177,9 +208,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Arguments {
             record: Some(_), ..
         } => Keep::Records,
-        Arguments {
-            failures: Some(_), ..
-        } => failures::to_keep(courses.settings()),
+        _ if failures.is_some() => failures::to_keep(courses.settings()),
         Arguments { plot: Some(_), .. } => Keep::Positions(MOST_DRAWN as u64),
         _ => Keep::Scores,
     };
@@ -217,7 +246,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for note in shapes_trained_on(&config, &courses) {
         note!("{note}");
     }
-    let progress = Progress::new(evaluation.total());
+    let progress = Progress::new("episode", evaluation.total());
     let evaluated = evaluation.run_and_tell(&|flown| progress.tell(flown));
     progress.finish();
     let evaluated = evaluated?;
@@ -239,11 +268,10 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let drawn = arguments.plot.as_ref().map_or(Ok(()), |file| {
         plot::draw(&courses, &evaluated.episodes, file)
     });
-    let failures = arguments
-        .failures
+    let failures = failures
         .as_ref()
         .map(|file| failures::draw(&courses, &evaluated.episodes, file, stdout_columns()));
-    let filmed = arguments.gif.as_ref().map_or(Ok(()), |file| {
+    let filmed = gif.as_ref().map_or(Ok(()), |file| {
         let again = self::courses(arguments, &config, &path)?.with_episodes(1);
         film::draw(&snapshot, &config, again, decoder, file)
     });
@@ -339,8 +367,8 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
         ("--json", arguments.json.clone()),
         ("--record", arguments.record.clone()),
         ("--plot", arguments.plot.clone()),
-        ("--failures", arguments.failures.clone()),
-        ("--gif", arguments.gif.clone()),
+        ("--failures", arguments.pictures.failures.clone()),
+        ("--gif", arguments.pictures.gif.clone()),
         (
             "the unfinished file of --record",
             arguments.record.as_deref().map(temporary_path),
@@ -351,11 +379,15 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
         ),
         (
             "the unfinished file of --failures",
-            arguments.failures.as_deref().map(unfinished_picture),
+            arguments
+                .pictures
+                .failures
+                .as_deref()
+                .map(unfinished_picture),
         ),
         (
             "the unfinished file of --gif",
-            arguments.gif.as_deref().map(unfinished_picture),
+            arguments.pictures.gif.as_deref().map(unfinished_picture),
         ),
     ];
     let outputs: Vec<_> = outputs

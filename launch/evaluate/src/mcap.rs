@@ -9,7 +9,10 @@ use skein_recordings::{Episode, Recording};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::EvaluatedEpisode;
 
-/// Writes `episodes`, entry by entry, to `path`.
+use crate::progress::Progress;
+
+/// Writes `episodes`, entry by entry, to `path`, and says how far it is: with a decoder, a step
+/// takes longer than it was flown in.
 ///
 /// # Errors
 /// Of the file, or if a course cannot be generated again.
@@ -22,6 +25,11 @@ pub(crate) fn write(
 ) -> io::Result<()> {
     let entries = courses.evaluation();
     let names: Vec<_> = entries.map(|entry| entry.name.as_str()).collect();
+    let progress = Progress::new(
+        "recording episode",
+        episodes.iter().flatten().count() as u64,
+    );
+    let mut written = 0;
     let mut recording =
         Recording::create(path, courses.settings(), lengths.action, &names, decoder)?;
     for (entry_number, (entry, episodes)) in (0..).zip(courses.evaluation().zip(episodes)) {
@@ -35,8 +43,12 @@ pub(crate) fn write(
                 lengths,
                 score: episode.score,
             };
-            recording.add(&header, episode.records.iter().map(|record| &**record))?;
+            let records = episode.records.iter().map(|record| &**record);
+            recording.add(&header, records)?;
+            written += 1;
+            progress.tell(written);
         }
     }
+    progress.finish();
     recording.finish()
 }

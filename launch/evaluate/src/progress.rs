@@ -1,4 +1,4 @@
-//! How far an evaluation is, in one line of the terminal.
+//! How far an evaluation or its recording is, in one line of the terminal.
 
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -12,8 +12,9 @@ const REDRAW: Duration = Duration::from_millis(200);
 /// The same elsewhere, where every line stays.
 const PLAIN: Duration = Duration::from_secs(30);
 
-/// Progress of an evaluation of so many episodes.
+/// Progress of what is done with so many episodes.
 pub(crate) struct Progress {
+    doing: &'static str,
     episodes: u64,
     begun: Instant,
     redraws: bool,
@@ -22,9 +23,11 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    pub(crate) fn new(episodes: u64) -> Self {
+    /// Begins. `doing` stands before the number of the episode.
+    pub(crate) fn new(doing: &'static str, episodes: u64) -> Self {
         let now = Instant::now();
         Self {
+            doing,
             episodes,
             begun: now,
             redraws: can_redraw(),
@@ -32,8 +35,8 @@ impl Progress {
         }
     }
 
-    /// Says that `flown` episodes have been flown, if it is time to.
-    pub(crate) fn tell(&self, flown: u64) {
+    /// Says that `done` episodes are done, if it is time to.
+    pub(crate) fn tell(&self, done: u64) {
         let pause = if self.redraws { REDRAW } else { PLAIN };
         // Another thread is writing: its line is as new.
         let Ok(mut last) = self.last.try_lock() else {
@@ -42,7 +45,7 @@ impl Progress {
         if last.0.elapsed() < pause {
             return;
         }
-        let line = line(flown, self.episodes, self.begun.elapsed());
+        let line = line(self.doing, done, self.episodes, self.begun.elapsed());
         *last = (Instant::now(), self.redraws);
         match self.redraws {
             true => notes::write(format!("\r\x1b[2K{}", cut(&line, stderr_columns()))),
@@ -59,10 +62,10 @@ impl Progress {
     }
 }
 
-fn line(flown: u64, episodes: u64, passed: Duration) -> String {
-    let left = passed.as_secs_f64() * (episodes - flown.min(episodes)) as f64 / flown.max(1) as f64;
+fn line(doing: &str, done: u64, episodes: u64, passed: Duration) -> String {
+    let left = passed.as_secs_f64() * (episodes - done.min(episodes)) as f64 / done.max(1) as f64;
     format!(
-        "episode {flown}/{episodes} · {}, {} left",
+        "{doing} {done}/{episodes} · {}, {} left",
         Clock(passed.as_secs_f64()),
         Clock(left)
     )
@@ -74,7 +77,7 @@ mod tests {
 
     #[test]
     fn a_line_says_how_far_it_is_and_how_long_it_will_take() {
-        let at = |flown, secs| line(flown, 200, Duration::from_secs(secs));
+        let at = |done, secs| line("episode", done, 200, Duration::from_secs(secs));
         assert_eq!(at(50, 35), "episode 50/200 · 0:35, 1:45 left");
         assert_eq!(at(1, 60), "episode 1/200 · 1:00, 3:19:00 left");
         assert_eq!(at(200, 70), "episode 200/200 · 1:10, 0:00 left");

@@ -363,7 +363,7 @@ function scene({ corridor_m: corridor, walls: closed, obstacles_m: obstacles }, 
   const room = {
     xaxis: axis("along, m", [0, length]), yaxis: axis("left, m", [-width / 2, width / 2]), zaxis: axis("up, m", [0, height]),
     aspectmode: "manual", aspectratio: { x: 2.6, y: 0.7, z: 0.7 * height / width },
-    camera: { eye: { x: -1.3, y: -2.0, z: 0.8 }, center: { x: -0.1, y: 0, z: -0.25 } },
+    camera: { eye: { x: -1.85, y: -2.1, z: 0.95 }, center: { x: -0.2, y: 0, z: -0.2 } },
   };
   return {
     plot, last,
@@ -404,7 +404,7 @@ function player(last, go) {
 async function flights(kept) {
   const id = lastChosen();
   const [{ recordings }] = await Promise.all([ask("recordings", [["run", id]]), plotly()]);
-  const source = select("Flights", [["recordings", `recorded (${recordings.length})`], ["evaluation", "final evaluation: positions alone"]],
+  const source = select(`Flights of ${id}`, [["recordings", `recorded (${recordings.length})`], ["evaluation", "final evaluation: positions alone"]],
     state.source, (value) => { state.source = value; show(); });
   if (recordings.length > 0 && state.source === "recordings") return recordedFlight(kept, id, recordings, source);
   if (recordings.length > 0) {
@@ -486,9 +486,7 @@ const SHOWN = [["position_m", "position, m"], ["velocity_mps", "velocity, m/s"],
 
 function numbersTable(flight, step) {
   const { numbers } = flight.steps[step];
-  // Without a teacher, its actions are zero.
-  const isThere = (column) => numbers[column] && (column !== "oracle_action" || flight.steps.some((one) => (one.numbers[column] || []).some((value) => value !== 0)));
-  const rows = SHOWN.filter(([column]) => isThere(column)).map(([column, title]) => [title, numbers[column].map((value) => (value ?? NaN).toFixed(2)).join("  ")]);
+  const rows = SHOWN.filter(([column]) => numbers[column]).map(([column, title]) => [title, numbers[column].map((value) => (value ?? NaN).toFixed(2)).join("  ")]);
   return table(["at this step", ""], rows, [1]);
 }
 
@@ -498,7 +496,10 @@ function outcomeOf(flight) {
 }
 
 function recordingTitle(name) {
-  return name.replace(/\.mcap$/, "").replaceAll("-", " ").replaceAll("_", " ").replace(/(\d+)of(\d+)$/, "$1 of $2 walls");
+  const parts = /^(training|evaluation)-(?:(\d+)-)?(\d+)-(.+)-(\d+)of(\d+)\.mcap$/.exec(name);
+  if (!parts) return name;
+  const [, kind, evaluation, episode, outcome, passed, walls] = parts;
+  return `${kind}${evaluation ? ` ${evaluation}, ` : " "}episode ${episode}: ${OUTCOME_NAMES[outcome] || outcome}, ${passed} of ${walls} walls`;
 }
 
 async function recordedFlight(kept, id, recordings, source) {

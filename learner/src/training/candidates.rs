@@ -1,8 +1,6 @@
 //! Confirmation episodes, which judge candidates for the best snapshot, and the final evaluation of
 //! the best one.
 
-use std::ops::Range;
-
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::LearnerPhase;
 use skein_protocol::stages::Stage;
@@ -147,22 +145,6 @@ impl Training<'_> {
             )
     }
 
-    /// Flies `episodes` evaluation episodes on each of `courses` with a published snapshot.
-    fn evaluate_on(
-        &mut self,
-        version: PolicyVersion,
-        courses: Range<u32>,
-        episodes: u64,
-        keep: KeptData,
-    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
-        let (run, number) = (self.identity.run, self.progress.evaluations);
-        let tickets = curriculum::evaluation(self.config, run, number, version, courses, episodes);
-        let total = tickets.len() as u64;
-        let flown = self.fly(tickets, (0, total), keep)?;
-        self.count_evaluation(total);
-        Ok(flown)
-    }
-
     /// Flies `tickets`, whose snapshot is published. `progress`: episodes of this evaluation flown
     /// before, and all of them.
     fn fly(
@@ -190,6 +172,25 @@ impl Training<'_> {
         Ok(flown)
     }
 
+    /// Flies the final evaluation with a published snapshot. The first episode keeps its images, to
+    /// be shown beside their reconstructions.
+    fn fly_evaluation(
+        &mut self,
+        version: PolicyVersion,
+    ) -> Result<Vec<CommittedEpisode>, TrainingError> {
+        let (run, number) = (self.identity.run, self.progress.evaluations);
+        let courses = self.config.courses.evaluation.len() as u32;
+        let episodes = self.config.evaluation.episodes;
+        let mut tickets =
+            curriculum::evaluation(self.config, run, number, version, 0..courses, episodes);
+        let total = tickets.len() as u64;
+        let rest = tickets.split_off(tickets.len().min(1));
+        let mut flown = self.fly(tickets, (0, total), KeptData::Depth)?;
+        flown.extend(self.fly(rest, (1, total), KeptData::Latents)?);
+        self.count_evaluation(total);
+        Ok(flown)
+    }
+
     /// Counts an evaluation of so many episodes.
     fn count_evaluation(&mut self, episodes: u64) {
         self.progress.evaluations += 1;
@@ -211,20 +212,13 @@ impl Training<'_> {
         let best = self.kept_snapshot(version)?;
         let sha256 = best.sha256();
         self.receiver.publish(best)?;
-        let courses = self.config.courses.evaluation.len() as u32;
-        let flown = self.evaluate_on(
-            version,
-            0..courses,
-            self.config.evaluation.episodes,
-            KeptData::Latents,
-        )?;
-        let pictured = self.evaluate_on(version, 0..1, 1, KeptData::Depth)?;
+        let flown = self.fly_evaluation(version)?;
         die_if_armed(FaultPoint::LearnerEvaluated);
         let (report, pictures) = self.disk.with_room(self.directory.root(), || {
             let report =
                 evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
             let trainer = &mut self.trainer;
-            let pictures = evaluation::write_reconstructions(self.directory, trainer, &pictured)?;
+            let pictures = evaluation::write_reconstructions(self.directory, trainer, &flown)?;
             Ok::<_, EvaluationWriteError>((report, pictures))
         })?;
         self.metrics.evaluation(self.last_episode(), &report)?;

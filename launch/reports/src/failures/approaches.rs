@@ -54,7 +54,7 @@ impl Approach {
 }
 
 /// Returns how the approaches of `episodes` ended, as a table of at most `columns`: by shape, worst
-/// first, by clearance and by offset.
+/// first, by clearance and by offset. Names the worlds, which have no walls to approach.
 pub fn approaches_table(episodes: &[FlownEpisode<'_>], columns: usize) -> String {
     let approaches: Vec<_> = episodes.iter().flat_map(Approach::of).collect();
     let mut rows = by_shape(&approaches);
@@ -62,18 +62,28 @@ pub fn approaches_table(episodes: &[FlownEpisode<'_>], columns: usize) -> String
     let offset: Measure = ("offset", |approach| approach.offset_m);
     rows.extend(by_class(&approaches, clearance, &CLEARANCES_M));
     rows.extend(by_class(&approaches, offset, &OFFSETS_M));
-    rates_table(
-        &[
-            "approaches",
-            "number",
-            "passed",
-            "hit the wall",
-            "hit the corridor",
-            "timed out",
-        ],
-        &rows,
-        columns,
-    )
+    let titles = [
+        "approaches",
+        "number",
+        "passed",
+        "hit the wall",
+        "hit the corridor",
+        "timed out",
+    ];
+    let table = (!rows.is_empty()).then(|| rates_table(&titles, &rows, columns));
+    let texts: Vec<_> = table.into_iter().chain(worlds(episodes)).collect();
+    texts.join("\n")
+}
+
+/// Returns a sentence that names the worlds among the courses of `episodes`, if there are any.
+fn worlds(episodes: &[FlownEpisode<'_>]) -> Option<String> {
+    let in_worlds = episodes.iter().filter(|episode| episode.course.is_world());
+    let mut names: Vec<_> = in_worlds.map(|episode| episode.course_name).collect();
+    names.dedup();
+    (!names.is_empty()).then(|| {
+        let names = names.join("; ");
+        format!("Not among the approaches, because a world has no walls: {names}.")
+    })
 }
 
 /// Name and value of what approaches are classed by.
@@ -142,6 +152,10 @@ fn row(label: String, group: &[&Approach]) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use skein_simulator::course::Course;
+
     use super::super::tests::collided;
     use super::*;
 
@@ -202,5 +216,29 @@ mod tests {
         assert_eq!(cells("shape: circle")[2..7], ["3", "66.7 %", "1", "·", "·"]);
         assert_eq!(cells("offset: 0.50 to 1.00 m")[2], "3");
         assert_eq!(cells("offset: 1.50 to 2.00 m")[2], "2");
+        assert!(!table.contains("world"), "{table}");
+    }
+
+    #[test]
+    fn worlds_are_named_instead_of_an_empty_table() {
+        let path = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../../configs/worlds/forest.toml"
+        );
+        let world = FlownEpisode {
+            course_name: "a forest",
+            course: Arc::new(Course::load(path).unwrap()),
+            ..collided(&[[1.5, 0.0, 3.5]], 0, Some(1))
+        };
+        let alone = approaches_table(&[world.clone(), world.clone()], 200);
+        assert_eq!(
+            alone,
+            "Not among the approaches, because a world has no walls: a forest."
+        );
+        let both = approaches_table(&[collided(&[[1.5, 0.0, 3.5]], 0, Some(1)), world], 200);
+        assert!(
+            both.contains("shape: circle") && both.ends_with("a forest."),
+            "{both}"
+        );
     }
 }

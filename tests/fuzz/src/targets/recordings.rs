@@ -68,7 +68,7 @@ static SOUND: LazyLock<Vec<u8>> = LazyLock::new(|| {
         },
     };
     let record = Box::new(TransitionRecord::zeroed());
-    recording.add(&episode, [&*record, &*record]).unwrap();
+    recording.add(&episode, [&*record; 2].into_iter()).unwrap();
     recording.finish().unwrap();
     std::fs::read(path).unwrap()
 });
