@@ -14,8 +14,9 @@ Trains 120 episodes of configs/generalist.toml in each way of ROUNDS rounds (4):
   shown     while headless Chromium shows the page on the same machine, if it is installed
   recorded  with every training episode recorded (run.record_every=1)
 
-Prints the wall seconds of each, then the median over the rounds of each way's time divided by the plain one's of its round. About
-half a minute a training on two cores, which should do nothing else. Every way must end with the same policy. Then copies of a run,
+Prints seconds of each: on the clock, of the processor for the run, and of the processor for the page's server; then medians over
+the rounds of the first two, divided by the plain way's of the same round. On a virtual machine the clock scatters by tenths, the
+processor's time less. About half a minute a training on two cores, which should do nothing else. Every way must end with the same policy. Then copies of a run,
 50 with 20,000 episodes and one with 1,000,000, are listed, described and drawn: seconds of each answer, and the server's memory.
 
 Exit status: 0 all policies are equal, 1 something failed or differs, 2 wrong arguments.
@@ -27,11 +28,10 @@ END
 
 # What a page that shows a run's curves, settings, actors and newest episodes asks for.
 read_page() {
-    local address=$1 run=$2 what
+    local api=$1/api run=$2
     while true; do
-        for what in runs "run?run=$run" "curves?curve=return&run=$run" "flights?run=$run" "recordings?run=$run"; do
-            curl -s -m 5 "$address/api/$what" >/dev/null || true
-        done
+        curl -s -m 5 "$api/runs" "$api/run?run=$run" "$api/curves?curve=return&run=$run" "$api/flights?run=$run" \
+            "$api/recordings?run=$run" >/dev/null || true
         sleep 1
     done
 }
@@ -46,7 +46,8 @@ serve() {
 }
 
 train() {
-    local run=$1 way=$2 settings=() watchers=() began ended server address
+    local run=$1 way=$2 settings=() watchers=() times served=0 server address
+    local TIMEFORMAT='%R %U %S'
     [[ $way != recorded ]] || settings=(--set run.record_every=1)
     if [[ $way == watched || $way == shown ]]; then
         serve "$runs"
@@ -59,19 +60,27 @@ train() {
         fi
         watchers+=($!)
     fi
-    began=$EPOCHREALTIME
-    "$programs/skein" run --config "$repository/configs/generalist.toml" --run-dir "$runs/$run" --actors 1 \
+    times=$({ time "$programs/skein" run --config "$repository/configs/generalist.toml" --run-dir "$runs/$run" --actors 1 \
         --set run.episodes=120 --set evaluation.every_episodes=1000 --set evaluation.episodes=1 \
-        ${settings[@]+"${settings[@]}"} >"$runs/$run.log" 2>&1
-    ended=$EPOCHREALTIME
-    ((${#watchers[@]} == 0)) || { kill "${watchers[@]}" && exec {page}<&-; }
+        ${settings[@]+"${settings[@]}"} >"$runs/$run.log" 2>&1; } 2>&1)
+    if ((${#watchers[@]} > 0)); then
+        served=$(awk -v ticks="$(getconf CLK_TCK)" '{ print ($14 + $15) / ticks }' "/proc/$server/stat")
+        kill "${watchers[@]}" && exec {page}<&-
+    fi
     wait
-    awk -v way="$way" -v began="$began" -v ended="$ended" -v policy="$(policy_of "$run")" \
-        'BEGIN { printf "%-8s %6.2f s  policy %.16s\n", way, ended - began, policy }' | tee -a "$runs/times"
+    awk -v way="$way" -v served="$served" -v policy="$(policy_of "$run")" '{
+        printf "%-8s %6.2f s, of the processor %6.2f s and the page\x27s server %4.2f s, policy %.16s\n", way, $1, $2 + $3, served, policy
+    }' <<<"$times" | tee -a "$runs/times"
 }
 
 policy_of() {
     sed -n 's/.*"policy_sha256": *"\([0-9a-f]*\)".*/\1/p' "$runs/$1/summary.json"
+}
+
+# Median over the rounds of a column of $runs/times, divided by the plain way's in the same round.
+median_ratio() {
+    awk -v way="$1" -v column="$2" '$1 == "plain" { plain = $column } $1 == way { print $column / plain }' "$runs/times" |
+        sort -n | awk '{ all[NR] = $1 } END { printf "%.3f", (all[int((NR + 1) / 2)] + all[int(NR / 2) + 1]) / 2 }'
 }
 
 # Copies a run into another folder, its episodes repeated until there are so many.
@@ -110,9 +119,8 @@ for ((round = 1; round <= ${1-4}; round++)); do
     done
 done
 bear_many
-echo "time beside plain, median of the rounds:"
+echo "beside plain, medians: time on the clock, processor's time"
 for way in "${ways[@]:1}"; do
-    awk -v way="$way" '$1 == "plain" { plain = $2 } $1 == way { print $2 / plain }' "$runs/times" |
-        sort -n | awk -v way="$way" '{ all[NR] = $1 } END { printf "%-8s %.3f\n", way, (all[int((NR + 1) / 2)] + all[int(NR / 2) + 1]) / 2 }'
+    echo "$way $(median_ratio "$way" 2) $(median_ratio "$way" 7)"
 done
 [[ $(awk '{ print $NF }' "$runs/times" | sort -u | wc -l) == 1 ]] || { echo "watched.sh: the policies differ" >&2 && exit 1; }
