@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, TensorView};
 use serde::Serialize;
+use skein_inference::Decoder;
 use skein_protocol::config::{Config, CoursesSection};
 use skein_protocol::evaluation::{CourseEvaluation, EpisodeScore, EvaluationReport};
 use skein_protocol::ids::PolicyVersion;
@@ -140,31 +141,36 @@ pub(crate) struct Reconstructions {
 }
 
 /// Writes some depth images beside their reconstructions, `reconstructions.safetensors`, and
-/// returns them. Writes nothing where there is no VAE.
+/// returns them. Of an encoder from a file, `decoder` draws them; without one and without a VAE,
+/// nothing is written.
 ///
 /// # Errors
 /// [`EvaluationWriteError`] names the file.
 pub(crate) fn write_reconstructions(
     directory: &RunDirectory,
     trainer: &mut Trainer,
+    decoder: Option<&Decoder>,
     episodes: &[CommittedEpisode],
 ) -> Result<Option<Reconstructions>, EvaluationWriteError> {
-    let depth = episodes
-        .iter()
-        .filter_map(|episode| episode.depth.as_deref())
-        .flat_map(|depth| depth.chunks(IMAGE_PIXELS));
-    let images: Vec<&[u8]> = depth.collect();
-    let stride = (images.len() / PICTURES).max(1);
-    let chosen: Vec<u8> = images
-        .iter()
-        .step_by(stride)
-        .take(PICTURES)
-        .copied()
-        .flatten()
-        .copied()
-        .collect();
-    let Some(reconstruction) = trainer.reconstruct(&chosen) else {
-        return Ok(None);
+    let seen = episodes.iter().flat_map(|episode| {
+        let depth = episode.depth.as_deref().unwrap_or_default();
+        depth.chunks(IMAGE_PIXELS).zip(&episode.observations)
+    });
+    let seen: Vec<_> = seen.collect();
+    let stride = (seen.len() / PICTURES).max(1);
+    let shown = || seen.iter().step_by(stride).take(PICTURES);
+    let chosen: Vec<u8> = shown().flat_map(|(depth, _)| *depth).copied().collect();
+    let latent = trainer.latent();
+    let decoded = |decoder: &Decoder| {
+        let codes = shown().map(|(_, seen)| &seen.latent[..latent]);
+        codes.flat_map(|code| decoder.decode(code)).collect()
+    };
+    let reconstruction = match trainer.reconstruct(&chosen) {
+        Some(reconstruction) => reconstruction,
+        None => match decoder {
+            Some(decoder) => decoded(decoder),
+            None => return Ok(None),
+        },
     };
     let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
     let view = |bytes| TensorView::new(Dtype::U8, shape.clone(), bytes);

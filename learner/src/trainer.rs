@@ -472,6 +472,11 @@ impl Trainer {
         Snapshot { version, values }
     }
 
+    /// Returns the numbers of a latent code.
+    pub(crate) fn latent(&self) -> usize {
+        self.config.vae.latent
+    }
+
     /// Returns the VAE's reconstruction of `images`, both `[n, 72, 128]` u8; `None` without a VAE.
     pub(crate) fn reconstruct(&mut self, images: &[u8]) -> Option<Vec<u8>> {
         let vae = self.source.vae_mut()?;

@@ -153,7 +153,7 @@ def with_sb3(seed, asked):
     import torch
     from stable_baselines3.common.callbacks import BaseCallback
 
-    torch.set_num_threads(asked.threads)
+    torch.set_num_threads(1)
     model = sb3.SAC(
         "MlpPolicy",
         Flat(),
@@ -182,7 +182,7 @@ def with_cleanrl(seed, asked):
     import torch
     from torch import nn
 
-    torch.set_num_threads(asked.threads)
+    torch.set_num_threads(1)
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     env = Flat()
@@ -306,7 +306,7 @@ def main():
     parser.add_argument("--peers", default=",".join(PEERS))
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--steps", type=int, default=30_000)
-    parser.add_argument("--threads", type=int, default=2, help="of PyTorch and of Skein's learner")
+    parser.add_argument("--threads", type=int, default=2, help="of Skein's learner; PyTorch has one, with which it is faster")
     parser.add_argument("--skein", default=str(REPOSITORY / "target" / "release" / "skein"))
     asked = parser.parse_args()
     names = asked.peers.split(",")

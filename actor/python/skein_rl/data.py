@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import struct
 from collections.abc import Iterator, Mapping
@@ -44,6 +45,8 @@ class Recording:
         action_names: names of the columns of ``action`` and ``oracle_action``.
         events: for each episode, rows of it and what happened there. Of an MCAP file alone.
         scenes: for each episode, its walls and obstacles by name. Of an MCAP file alone.
+        period_secs: from one step to the next. Of an MCAP file; otherwise the usual one.
+        horizontal_fov_deg: the camera's angle of view. Of an MCAP file; otherwise the usual one.
     """
 
     columns: Columns = field(repr=False)
@@ -52,6 +55,8 @@ class Recording:
     action_names: list[str]
     events: list[list[tuple[int, str]]] = field(default_factory=list, repr=False)
     scenes: list[dict[str, Solid]] = field(default_factory=list, repr=False)
+    period_secs: float = 0.5
+    horizontal_fov_deg: float = 90.0
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self.columns[name]
@@ -171,13 +176,16 @@ def _from_messages(reader: Any) -> Recording:
     events: list[list[tuple[int, str]]] = []
     scenes: list[dict[str, Solid]] = []
     begin = 0
-    for _, channel, _, message in reader.iter_decoded_messages(log_time_order=False):
+    nanos: list[int] = []
+    for _, channel, logged, message in reader.iter_decoded_messages(log_time_order=False):
         row = len(messages.get("/drone/step", ())) - 1
         if channel.topic == "/scene" and message.deletions:
             # It begins an episode; others are pieces of the trail.
             begin = row + 1
             scenes.append(_solids(message))
             events.append([])
+        elif channel.topic == "/drone/step":
+            nanos.append(logged.log_time)
         elif channel.topic == "/events":
             events[-1].append((max(row - begin, 0), message.message))
         messages.setdefault(channel.topic, []).append(message)
@@ -187,8 +195,18 @@ def _from_messages(reader: Any) -> Recording:
             columns[name] = np.stack(images).reshape(-1, 72, 128)
     lists = {found.name: found.metadata for found in reader.iter_metadata()}
     names = {name: [texts[str(place)] for place in range(len(texts))] for name, texts in lists.items()}
+    focal_px = messages["/camera/calibration"][0].K[0]
+    # An episode has at least two rows; those of a segment need not begin with step 0.
+    steps = int(columns["step"][1]) - int(columns["step"][0])
     return Recording(
-        columns, names["course_names"], names["reward_term_names"], names["action_names"], events, scenes
+        columns,
+        names["course_names"],
+        names["reward_term_names"],
+        names["action_names"],
+        events,
+        scenes,
+        (nanos[1] - nanos[0]) / 1e9 / steps,
+        2 * math.degrees(math.atan(64 / focal_px)),
     )
 
 

@@ -25,7 +25,7 @@ class Policy:
 
     It remembers the episode, because a policy may see earlier steps. Call :meth:`reset` when an
     episode begins, or tell :meth:`act` which ones do. Its actions are equal to an actor's, bit for
-    bit.
+    bit. A copy or a pickle has the networks, not the episode: it begins anew.
 
     >>> policy = skein_rl.Policy.load("configs/snapshots/generalist.safetensors")
     >>> policy.reset()
@@ -159,19 +159,25 @@ class Policy:
                     f"call reset({rows}) first"
                 )
             self.reset(rows)
+        lead = () if single else (rows,)
+
+        def numbers(name: str, width: int) -> bytes | None:
+            """A part as bytes, ``[width]`` for one row and ``[rows, width]`` for several."""
+            part = observation.get(name)
+            return None if part is None else _numbers(name, part, (*lead, width))
+
         depth, latent = observation.get("depth"), observation.get("latent")
         if depth is None and latent is None:
             raise KeyError("the observation has neither \"depth\" nor \"latent\"")
-        previous, goal = observation.get("previous_action"), observation.get("goal")
-        if goal is None and "goal" in self.observation:
+        if observation.get("goal") is None and "goal" in self.observation:
             raise KeyError("the observation has no \"goal\": observe it, float32 [3]")
         starts = np.zeros(rows, np.bool_) if episode_start is None else np.atleast_1d(episode_start)
         block = self._core.act(
             None if depth is None or latent is not None else _images(depth, rows),
-            None if latent is None else _numbers(latent),
-            _numbers(velocity),
-            None if previous is None else _numbers(previous),
-            None if goal is None else _numbers(goal),
+            numbers("latent", self.latent),
+            _numbers("velocity", observation["velocity"], (*lead, 3)),
+            numbers("previous_action", len(self.action_names)),
+            numbers("goal", 3),
             starts.astype(np.bool_).tolist(),
             "mode" if deterministic else "sample",
         )
@@ -259,5 +265,10 @@ def _images(depth: Any, rows: int) -> bytes:
     return array.tobytes()
 
 
-def _numbers(numbers: Any) -> bytes:
-    return np.asarray(numbers, dtype=np.float32).tobytes()
+def _numbers(name: str, numbers: Any, shape: tuple[int, ...]) -> bytes:
+    array = np.asarray(numbers)
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name} has the dtype {array.dtype}: give float32")
+    if array.shape != shape:
+        raise ValueError(f"{name} has the shape {array.shape}, not {list(shape)}")
+    return array.astype(np.float32).tobytes()

@@ -19,8 +19,7 @@ from .data import Columns, Recording, Solid
 
 _HEIGHT, _WIDTH = 72, 128
 # As in the simulator's [camera] section.
-_CAMERA = {"horizontal_fov_deg": 90.0, "range_m": 20.0, "mount_m": [0.2, 0.0, 0.0], "mount_pitch_deg": 0.0}
-_PERIOD_SECS = 0.5
+_CAMERA = {"range_m": 20.0, "mount_m": [0.2, 0.0, 0.0], "mount_pitch_deg": 0.0}
 # The drone's width and height.
 _HALF_SIZE_M = [0.49, 0.49, 0.145]
 _WALL, _EDGE = [115, 128, 148, 190], [51, 56, 66]
@@ -30,15 +29,16 @@ def save(
     recording: Recording,
     path: str | os.PathLike[str],
     camera: Mapping[str, Any] | None = None,
-    period_secs: float = _PERIOD_SECS,
+    period_secs: float | None = None,
 ) -> None:
     """Writes a recording to a file ``.rrd``, with the layout that ``rerun FILE`` opens it in.
 
     Args:
         recording: of :func:`skein_rl.read_recording`.
         path: the file.
-        camera: what differs from the simulator's default ``[camera]``.
-        period_secs: ``simulator.vehicle.control_period_secs``.
+        camera: what differs from the simulator's default ``[camera]``, and from the recording's
+            angle of view.
+        period_secs: ``simulator.vehicle.control_period_secs``; by default the recording's.
 
     Raises:
         ImportError: Rerun is not installed.
@@ -55,13 +55,15 @@ def log(
     recording: Recording,
     stream: Any,
     camera: Mapping[str, Any] | None = None,
-    period_secs: float = _PERIOD_SECS,
+    period_secs: float | None = None,
 ) -> None:
     """Logs a recording to a ``rerun.RecordingStream``. Episodes follow each other on the timeline
     ``flight``. Arguments as of :func:`save`.
     """
     rr = _rerun()
-    settings = {**_CAMERA, **(camera or {})}
+    fov = {"horizontal_fov_deg": recording.horizontal_fov_deg}
+    settings = {**_CAMERA, **fov, **(camera or {})}
+    period_secs = period_secs or recording.period_secs
     stream.log("world", rr.ViewCoordinates.FLU, static=True)
     stream.log("world/drone/body", rr.Boxes3D(half_sizes=[_HALF_SIZE_M]), static=True)
     _log_camera(rr, stream, settings)

@@ -133,10 +133,24 @@ class Breaks(Tiny):
         return super().step(action)
 
 
+class Counts(Tiny):
+    """Says of walls what it is given."""
+
+    def __init__(self, **info):
+        super().__init__()
+        self.info = info
+
+    def step(self, action):
+        return (*super().step(action)[:4], self.info)
+
+
 @pytest.mark.parametrize(
     ("env", "error", "message"),
     [
         (Breaks(), RuntimeError, "battery is empty"),
+        (Counts(walls_passed=6), ValueError, r"\"walls_passed\"\] = 6 of 5 walls"),
+        (Counts(hit_wall=9), ValueError, r"\"hit_wall\"\] = 9 of 5 walls"),
+        (Counts(walls=0), ValueError, r"\"walls\"\] = 0"),
         (Tiny(velocity=np.array([1, np.nan, 0])), ValueError, r"env.reset\(\): velocity = .*nan"),
         (Tiny(velocity=np.ones(2)), ValueError, "velocity has 2 numbers, not 3"),
         (Tiny(depth=np.zeros((72, 127), np.uint8)), ValueError, r"depth is uint8 \[72, 127\]"),

@@ -87,7 +87,10 @@ def test_what_is_wrong_is_named(policy, env, tmp_path):
         ({"depth": observation["depth"][:, :50]}, "shape"),
         ({"velocity": np.array([np.nan, 0, 0])}, "velocity"),
         ({"velocity": np.zeros(2)}, "velocity"),
+        ({"velocity": np.zeros(3, complex)}, "velocity"),
         ({"previous_action": np.zeros(5)}, "previous_action"),
+        ({"previous_action": np.zeros((2, 2))}, "previous_action"),
+        ({"latent": np.zeros((policy.latent, 1), np.float32)}, "latent"),
         ({"velocity": np.zeros((2, 3))}, "rows"),
     ]:
         with pytest.raises(ValueError, match=part):

@@ -196,8 +196,9 @@ impl<'a> Recording<'a> {
                 record,
             };
             self.write_step(&row, missing)?;
+            self.log_passing(record, course)?;
         }
-        self.end_episode(&episode.score)
+        self.end_episode(&episode.score, course)
     }
 
     /// Writes what the numbers of a column in the steps stand for.
@@ -248,20 +249,28 @@ impl<'a> Recording<'a> {
             let trail = scene::trail(record.step, before_m, record.position_m, self.now);
             self.send(Topic::Scene, &trail)?;
         }
-        self.log_wall(record)
+        Ok(())
     }
 
-    fn log_wall(&mut self, record: &TransitionRecord) -> io::Result<()> {
+    fn log_passing(&mut self, record: &TransitionRecord, course: &Course) -> io::Result<()> {
         if record.walls_passed <= self.walls_passed {
             return Ok(());
         }
         self.walls_passed = record.walls_passed;
-        self.log(Level::Info, format!("passed wall {}", record.walls_passed))
+        let what = match course.is_world() {
+            true => "stage",
+            false => "wall",
+        };
+        let event = format!("passed {what} {}", record.walls_passed);
+        self.log(Level::Info, event)
     }
 
-    fn end_episode(&mut self, score: &EpisodeScore) -> io::Result<()> {
+    fn end_episode(&mut self, score: &EpisodeScore, course: &Course) -> io::Result<()> {
         let (level, event) = match (score.outcome, score.hit_wall) {
             (Outcome::ReachedEnd, _) => (Level::Info, "reached the end".to_owned()),
+            (Outcome::Collided, Some(_)) if course.is_world() => {
+                (Level::Error, "hit an obstacle".to_owned())
+            }
             (Outcome::Collided, Some(wall)) => (Level::Error, format!("hit wall {wall}")),
             (Outcome::Collided, None) => (Level::Error, "hit the corridor".to_owned()),
             (Outcome::TimedOut, _) => (Level::Warning, "timed out".to_owned()),

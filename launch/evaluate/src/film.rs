@@ -8,7 +8,7 @@ use anyhow::Context;
 use skein_inference::Decoder;
 use skein_protocol::config::Config;
 use skein_protocol::snapshot::Snapshot;
-use skein_protocol::transition::TransitionRecord;
+use skein_protocol::transition::{Outcome, TransitionRecord};
 use skein_reports::flight::{CodeView, FlightStep, draw_flight};
 use skein_rollout::courses::Courses;
 use skein_rollout::evaluation::{Evaluation, Keep};
@@ -49,7 +49,12 @@ pub(crate) fn draw(
     });
     let steps = episode.records.iter().zip(views);
     let steps: Vec<_> = steps.map(|(record, code)| step(record, code)).collect();
-    Ok(draw_flight(&course, &steps, &entry.name, file)?)
+    let ending = match episode.score.outcome {
+        Outcome::ReachedEnd => "reached the end",
+        Outcome::Collided => "collided",
+        Outcome::TimedOut => "timed out",
+    };
+    Ok(draw_flight(&course, &steps, &entry.name, ending, file)?)
 }
 
 fn step<'a>(record: &'a TransitionRecord, code: CodeView<'a>) -> FlightStep<'a> {

@@ -165,9 +165,16 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         check_recordable(file)?;
     }
     let Pictures { failures, gif } = &arguments.pictures;
-    let pictures = [&arguments.plot, failures, gif];
-    for file in pictures.into_iter().flatten() {
-        check_plottable(file)?;
+    let pictures = [
+        ("--plot", "png", &arguments.plot),
+        ("--failures", "png", failures),
+        ("--gif", "gif", gif),
+    ];
+    for (option, ending, file) in pictures {
+        if let Some(file) = file {
+            check_plottable(file)?;
+            check_ending(option, ending, file)?;
+        }
     }
     let (snapshot, trained) = Snapshot::load(&path)?;
     let flown = match arguments.suite {
@@ -283,9 +290,9 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(approaches) = failures {
         show!("{}", approaches?);
     }
-    for (what, file) in ["plot", "failures", "gif"].into_iter().zip(pictures) {
+    for (option, _, file) in pictures {
         if let Some(file) = file {
-            note!("{what}: {}", file.display());
+            note!("{}: {}", option.trim_start_matches('-'), file.display());
         }
     }
     Ok(())
@@ -337,6 +344,18 @@ fn record(
 fn write_json(file: &Path, report: &WrittenReport<'_>) -> anyhow::Result<()> {
     let json = serde_json::to_string_pretty(report).context("cannot write the result as JSON")?;
     fs::write(file, json).with_context(|| format!("cannot write {}", file.display()))
+}
+
+/// Checks that the file of a picture says what it is; so no file of a run is replaced by mistake.
+fn check_ending(option: &str, ending: &str, file: &Path) -> anyhow::Result<()> {
+    if file.extension().is_some_and(|there| there != ending) {
+        bail!(
+            "{option} {}: the picture is a {} file; give it a name that ends in .{ending}",
+            file.display(),
+            ending.to_uppercase()
+        );
+    }
+    Ok(())
 }
 
 /// Checks that a picture can be written to `file`. A picture replaces the file, so nothing but a
@@ -394,8 +413,19 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
         .into_iter()
         .filter_map(|(option, file)| Some((option, file?)))
         .collect();
+    let run = arguments.subject.run.as_ref().map(RunDirectory::new);
+    let of_run = run.iter().flat_map(|run| {
+        [
+            run.config(),
+            run.identity(),
+            run.summary_json(),
+            run.episodes_csv(),
+        ]
+        .map(|file| ("a file of the run", file))
+    });
     let inputs = [("the snapshot", snapshot.to_owned())]
         .into_iter()
+        .chain(of_run)
         .chain(
             arguments
                 .course

@@ -2,9 +2,8 @@
 //! camera sees, and what the policy sees instead: the latent code, or the image that the decoder
 //! makes of it.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
 use std::path::Path;
+use std::{fs, io};
 
 use gif::{DisposalMethod, Encoder, Frame, Repeat};
 use plotters::prelude::*;
@@ -30,6 +29,8 @@ const CODE: u32 = LEFT + IMAGE.0 + 30;
 const LONGEST_BAR: f32 = 3.0;
 /// Time of a picture, hundredths of a second: five times as fast as flown, at the usual period.
 const DELAY: u16 = 10;
+/// Most bytes of a film.
+const MOST_BYTES: usize = 3_000_000;
 /// Time of the last picture.
 const LAST_DELAY: u16 = 150;
 /// Height of the drone's body, metres. Source: as for [`DRONE_WIDTH_M`].
@@ -66,7 +67,9 @@ pub struct FlightStep<'a> {
     pub walls_passed: u8,
 }
 
-/// Draws an episode through `course` to `path`, as a GIF that repeats. `title` names it.
+/// Draws an episode through `course` to `path`, as a GIF that repeats. `title` names it, `ending`
+/// says how it ended. A film of more than 3 MB would be too much for a web page: a long one has
+/// fewer pictures.
 ///
 /// # Errors
 /// Returns [`ReportError`] if it cannot be drawn or written.
@@ -74,6 +77,7 @@ pub fn draw_flight(
     course: &Course,
     steps: &[FlightStep<'_>],
     title: &str,
+    ending: &str,
     path: &Path,
 ) -> Result<(), ReportError> {
     let stage = Stage::of(course);
@@ -81,13 +85,27 @@ pub fn draw_flight(
         return Ok(());
     };
     let empty = stage.empty(first.code)?;
-    let mut film = Film::new(WIDTH, stage.height);
-    for number in 0..steps.len() {
-        let mut canvas = empty.clone();
-        stage.draw(&mut canvas, &steps[..=number], title)?;
-        film.add(&canvas.averaged());
+    let last = steps.len() - 1;
+    let film = |stride: usize| {
+        let mut film = Film::new(WIDTH, stage.height, stride);
+        let ended = format!("{title}, {ending}");
+        for number in (0..last).step_by(stride).chain([last]) {
+            let mut canvas = empty.clone();
+            let title = if number == last { &ended } else { title };
+            stage.draw(&mut canvas, &steps[..=number], title)?;
+            film.add(&canvas.averaged());
+        }
+        film.encode()
+            .map_err(|error| ReportError::Draw(error.to_string()))
+    };
+    let mut stride = 1;
+    let mut bytes = film(stride)?;
+    // Fewer pictures, each shown longer.
+    while bytes.len() > MOST_BYTES && stride < steps.len() {
+        stride += 1;
+        bytes = film(stride)?;
     }
-    film.save(path)
+    replace_picture(path, |aside| fs::write(aside, &bytes))
 }
 
 /// Places of all that is drawn. Saved pixels.
@@ -304,6 +322,8 @@ fn drawn(x: u32, y: u32) -> (i32, i32) {
 struct Film {
     width: u32,
     height: u32,
+    /// Steps from one picture to the next.
+    stride: usize,
     /// Colour numbers of the last picture.
     last: Vec<u8>,
     frames: Vec<Frame<'static>>,
@@ -317,10 +337,11 @@ const LEVELS: usize = 5;
 const SAME: u8 = 255;
 
 impl Film {
-    fn new(width: u32, height: u32) -> Self {
+    fn new(width: u32, height: u32, stride: usize) -> Self {
         Self {
             width,
             height,
+            stride,
             last: Vec::new(),
             frames: Vec::new(),
         }
@@ -342,7 +363,7 @@ impl Film {
             false => SAME,
         };
         self.frames.push(Frame {
-            delay: DELAY,
+            delay: DELAY.saturating_mul(self.stride as u16),
             dispose: DisposalMethod::Keep,
             transparent: Some(SAME),
             left: left as u16,
@@ -355,20 +376,15 @@ impl Film {
         self.last = now;
     }
 
-    /// Writes the film. An existing file is replaced atomically; if a link names it, the link
-    /// stays.
-    fn save(mut self, path: &Path) -> Result<(), ReportError> {
+    /// Returns the film as the bytes of a file.
+    fn encode(mut self) -> io::Result<Vec<u8>> {
         if let Some(last) = self.frames.last_mut() {
             last.delay = LAST_DELAY;
         }
-        replace_picture(path, |aside| self.write(aside))
-    }
-
-    fn write(&self, path: &Path) -> io::Result<()> {
-        let mut file = BufWriter::new(File::create(path)?);
+        let mut bytes = Vec::new();
         let (width, height) = (self.width as u16, self.height as u16);
         let mut encoder =
-            Encoder::new(&mut file, width, height, &colours()).map_err(io::Error::other)?;
+            Encoder::new(&mut bytes, width, height, &colours()).map_err(io::Error::other)?;
         encoder
             .set_repeat(Repeat::Infinite)
             .map_err(io::Error::other)?;
@@ -376,7 +392,7 @@ impl Film {
             encoder.write_frame(frame).map_err(io::Error::other)?;
         }
         drop(encoder);
-        file.flush()
+        Ok(bytes)
     }
 }
 
@@ -423,11 +439,11 @@ mod tests {
         let steps = [step(2.0, &first), step(6.0, &second)];
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("flight.gif");
-        draw_flight(&course(), &steps, "two walls", &path).unwrap();
+        draw_flight(&course(), &steps, "two walls", "hits a wall", &path).unwrap();
 
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::Indexed);
-        let mut film = options.read_info(File::open(&path).unwrap()).unwrap();
+        let mut film = options.read_info(fs::File::open(&path).unwrap()).unwrap();
         assert_eq!(film.width(), WIDTH as u16);
         let whole = film.read_next_frame().unwrap().unwrap().clone();
         assert_eq!((whole.left, whole.width), (0, WIDTH as u16));
@@ -452,6 +468,29 @@ mod tests {
         );
         assert!(change.buffer.contains(&SAME), "most of it stays");
         assert!(film.read_next_frame().unwrap().is_none());
+    }
+
+    #[test]
+    fn a_long_film_has_fewer_pictures_and_stays_small() {
+        // Noise, which no picture shares with the next.
+        let image = |step: u32| -> Vec<u8> {
+            let noise = |pixel: u32| (pixel * 7919 + step * 104_729).wrapping_mul(2_654_435_761);
+            (0..9216).map(|pixel| (noise(pixel) >> 24) as u8).collect()
+        };
+        let images: Vec<_> = (0..120).map(image).collect();
+        let steps: Vec<_> = images
+            .iter()
+            .map(|image| FlightStep {
+                position_m: [2.0, 0.0, 3.5],
+                depth: image,
+                code: CodeView::Image(image),
+                walls_passed: 0,
+            })
+            .collect();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("flight.gif");
+        draw_flight(&course(), &steps, "noise", "times out", &path).unwrap();
+        assert!(fs::metadata(&path).unwrap().len() <= MOST_BYTES as u64);
     }
 
     #[test]

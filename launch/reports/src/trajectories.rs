@@ -150,7 +150,7 @@ pub fn draw_trajectories(courses: &[FlownCourse<'_>], path: &Path) -> Result<(),
     let omitted = if others.is_empty() { 0 } else { OMITTED };
     let mut canvas = Canvas::new(WIDTH, TOP + blocks + omitted);
     canvas.draw(|area| {
-        draw_legend(area)?;
+        draw_legend(area, shown.iter().any(|flown| !flown.course.is_world()))?;
         let mut top = TOP;
         for flown in shown {
             draw_course(area, flown, top)?;
@@ -472,26 +472,33 @@ fn draw_course(
     FrontViews::of(course, pixels_per_metre(course)).draw(area, episodes, below)
 }
 
-fn draw_legend(area: &Area<'_>) -> Result<(), Box<dyn std::error::Error>> {
+/// Explains the picture: `has_walls`, or only obstacles.
+fn draw_legend(area: &Area<'_>, has_walls: bool) -> Result<(), Box<dyn std::error::Error>> {
+    let (note, [dark, pale]) = match has_walls {
+        true => (
+            "Below each course, its walls from the front: a dot where the drone's centre crossed \
+             the wall, a cross where it collided within its own width of the wall.",
+            ["walls", "partly open: see the wall's front; obstacles"],
+        ),
+        false => (
+            "Each way begins where its episode did, at the left, and ends where the episode ended.",
+            ["obstacles in the middle", "at any height or side"],
+        ),
+    };
     let y = px(22) as i32;
     area.draw_text(
         "Evaluation episodes",
         &font(22),
         (px(LEFT) as i32, y - px(11) as i32),
     )?;
-    area.draw_text(
-        "Below each course, its walls from the front: a dot where the drone's centre crossed the \
-         wall, a cross where it collided within its own width of the wall.",
-        &font(15),
-        (px(LEFT) as i32, y + px(22) as i32),
-    )?;
+    area.draw_text(note, &font(15), (px(LEFT) as i32, y + px(22) as i32))?;
     let mut x = px(LEFT + 230) as i32;
     for (label, colour) in [
         ("reached the end", STRONG),
         ("collided", REFERENCE),
         ("timed out", TIMED_OUT),
-        ("walls", WALL),
-        ("partly open: see the wall's front; obstacles", PARTLY_OPEN),
+        (dark, WALL),
+        (pale, PARTLY_OPEN),
     ] {
         area.draw(&PathElement::new(
             [(x, y), (x + px(26) as i32, y)],

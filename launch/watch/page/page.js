@@ -327,6 +327,7 @@ function wallFigure(course, wall, number) {
 
 async function failures() {
   const { id, course, choice } = await evaluated();
+  if (!course.walls.length) return { nodes: [element("div", { class: "choices" }, choice), element("p", { class: "hint" }, `${id}: ${course.failed} of ${course.episodes} episodes failed. This course is a world of obstacles, which has no walls to draw them on: choose "Flights in 3-D".`)] };
   const figures = course.walls.map((wall, place) => wallFigure(course, wall, place + 1));
   const hint = `${id}: each wall from the front. A dot: an episode passed here; a cross: it collided or timed out within 1.3 m of the wall. Up to 60 episodes are drawn, those that failed first.`;
   return { nodes: [element("div", { class: "choices" }, choice), element("p", { class: "hint" }, hint), element("div", { class: "walls" }, ...figures)] };

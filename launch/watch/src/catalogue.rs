@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Component, Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -153,10 +154,12 @@ impl Catalogue {
         let last = last.into_iter().filter_map(changed).max()?;
         let id = path.strip_prefix(&self.root).ok()?.to_str()?.to_owned();
         let age = SystemTime::now().duration_since(last).unwrap_or_default();
-        let state = match (self.is_complete(&run), age < QUIET) {
-            (true, _) => State::Complete,
-            (false, true) => State::Running,
-            (false, false) => State::Stopped,
+        let state = if self.is_complete(&run) {
+            State::Complete
+        } else if age < QUIET || is_locked(&run.learner_lock()) {
+            State::Running
+        } else {
+            State::Stopped
         };
         let since_1970 = last.duration_since(SystemTime::UNIX_EPOCH);
         Some(ListedRun {
@@ -169,12 +172,25 @@ impl Catalogue {
     }
 }
 
+/// Returns `true` if a process on this machine holds the lock of `file`: a learner in its final
+/// evaluation may write nothing for long. The kernel's table tells it without a try, which a
+/// learner that starts could notice.
+fn is_locked(file: &Path) -> bool {
+    let Ok(there) = fs::metadata(file) else {
+        return false;
+    };
+    let named = format!(":{}", there.ino());
+    let holds = |line: &str| line.split(' ').any(|field| field.ends_with(&named));
+    fs::read_to_string("/proc/locks").is_ok_and(|table| table.lines().any(holds))
+}
+
 fn is_run(path: &Path) -> bool {
     path.join("config.toml").is_file()
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
     use std::os::unix::fs::symlink;
 
     use super::*;
@@ -200,6 +216,24 @@ mod tests {
             "just written"
         );
         assert_eq!(state("{"), State::Running);
+    }
+
+    #[test]
+    fn a_quiet_run_whose_learner_lives_is_under_way() {
+        let folder = tempfile::tempdir().unwrap();
+        run(folder.path(), "one");
+        let long_ago = SystemTime::now() - 100 * QUIET;
+        let config = File::options()
+            .write(true)
+            .open(folder.path().join("one/config.toml"));
+        config.unwrap().set_modified(long_ago).unwrap();
+        let lock = File::create(folder.path().join("one/learner.lock")).unwrap();
+        let state = || Catalogue::open(folder.path()).unwrap().runs()[0].state;
+        assert_eq!(state(), State::Stopped);
+        lock.lock().unwrap();
+        assert_eq!(state(), State::Running);
+        drop(lock);
+        assert_eq!(state(), State::Stopped);
     }
 
     #[test]

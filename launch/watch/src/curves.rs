@@ -18,10 +18,11 @@ const WINDOW: usize = 50;
 /// Value of a curve in one episode.
 type OfEpisode = fn(&Episode) -> f64;
 /// Curves from `episodes.csv`.
-const OF_EPISODES: [(&str, OfEpisode); 3] = [
+const OF_EPISODES: [(&str, OfEpisode); 4] = [
     ("walls passed", |row| f64::from(row.walls_passed)),
     ("return", |row| f64::from(row.episode_return)),
     ("steps per episode", |row| f64::from(row.steps)),
+    ("policy lag, epochs", |row| f64::from(row.lag)),
 ];
 
 /// A run, as far as it has been read.

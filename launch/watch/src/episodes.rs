@@ -20,6 +20,8 @@ pub(crate) struct Episode {
     pub(crate) episode_return: f32,
     pub(crate) actor: u16,
     pub(crate) walls_passed: u8,
+    /// Epochs that its policy was behind.
+    pub(crate) lag: u32,
 }
 
 /// The complete rows read so far.
@@ -105,7 +107,9 @@ impl Episodes {
 
 /// Reads episode,epoch,policy_version,actor,level,steps,walls_passed,return,outcome.
 fn row(line: &[u8]) -> Option<Episode> {
-    let mut cells = std::str::from_utf8(line).ok()?.split(',').skip(3);
+    let mut cells = std::str::from_utf8(line).ok()?.split(',').skip(1);
+    let epoch: u32 = cells.next()?.parse().ok()?;
+    let version = cells.next()?.parse().ok()?;
     let actor = cells.next()?.parse().ok()?;
     let steps = cells.nth(1)?.parse().ok()?;
     let walls_passed = cells.next()?.parse().ok()?;
@@ -115,6 +119,7 @@ fn row(line: &[u8]) -> Option<Episode> {
         episode_return,
         actor,
         walls_passed,
+        lag: epoch.saturating_sub(version),
     })
 }
 

@@ -1,6 +1,7 @@
 //! The final evaluation of a run: courses, trajectories, and where episodes failed.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 use anyhow::Context;
 use serde::{Deserialize, Serialize};
@@ -86,7 +87,16 @@ fn courses(catalogue: &Catalogue, run: &RunDirectory) -> anyhow::Result<Vec<Cour
         })
         .collect();
     files.sort();
-    let load = |path: &std::path::PathBuf| Ok(Course::load(catalogue.inside(path)?)?);
+    let load = |path: &PathBuf| {
+        let path = catalogue.inside(path)?;
+        for mesh in Course::mesh_files(&path)? {
+            let outside = || format!("mesh {} of {}", mesh.display(), path.display());
+            catalogue
+                .inside(&folder.join(&mesh))
+                .with_context(outside)?;
+        }
+        Ok(Course::load(path)?)
+    };
     files.iter().map(load).collect()
 }
 
@@ -148,6 +158,19 @@ fn of_course(course: &Course, flights: &[Flight]) -> FlownCourse {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_mesh_outside_the_folder_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = RunDirectory::new(folder.path().join("watched/run"));
+        std::fs::create_dir_all(run.courses()).unwrap();
+        std::fs::write(folder.path().join("m.obj"), "v 0 0 0\n").unwrap();
+        let text = "[[obstacle]]\nshape = \"mesh\"\nfile = \"../../../m.obj\"\n";
+        std::fs::write(run.courses().join("a.toml"), text).unwrap();
+        let catalogue = Catalogue::open(&folder.path().join("watched")).unwrap();
+        let error = format!("{:#}", courses(&catalogue, &run).unwrap_err());
+        assert!(error.contains("leads out of the watched folder"), "{error}");
+    }
 
     #[test]
     fn flights_are_told_apart_and_a_torn_row_is_left_out() {

@@ -1,12 +1,18 @@
 //! Confirmation episodes, which judge candidates for the best snapshot, and the final evaluation of
 //! the best one.
 
+use skein_inference::Decoder;
+use skein_kernels::Isa;
+use skein_protocol::decoder_file::TrainedDecoder;
+use skein_protocol::encoder_file::TrainedEncoder;
 use skein_protocol::ids::{Epoch, PolicyVersion};
 use skein_protocol::progress::LearnerPhase;
+use skein_protocol::snapshot::Snapshot;
 use skein_protocol::stages::Stage;
 use skein_protocol::summary::Trained;
 use skein_protocol::ticket::Ticket;
 use skein_run::fault::{FaultPoint, die_if_armed};
+use tracing::warn;
 
 use super::{Training, TrainingError};
 use crate::best::{is_better, is_candidate, may_replace, next_look};
@@ -211,6 +217,7 @@ impl Training<'_> {
         };
         let best = self.kept_snapshot(version)?;
         let sha256 = best.sha256();
+        let decoder = self.decoder_of(&best);
         self.receiver.publish(best)?;
         let flown = self.fly_evaluation(version)?;
         die_if_armed(FaultPoint::LearnerEvaluated);
@@ -218,7 +225,9 @@ impl Training<'_> {
             let report =
                 evaluation::write_report(self.directory, self.config, version, &sha256, &flown)?;
             let trainer = &mut self.trainer;
-            let pictures = evaluation::write_reconstructions(self.directory, trainer, &flown)?;
+            let decoder = decoder.as_ref();
+            let pictures =
+                evaluation::write_reconstructions(self.directory, trainer, decoder, &flown)?;
             Ok::<_, EvaluationWriteError>((report, pictures))
         })?;
         self.metrics.evaluation(self.last_episode(), &report)?;
@@ -228,5 +237,18 @@ impl Training<'_> {
                 .reconstructions(episode, &pictures.depth, &pictures.reconstruction)?;
         }
         Ok(())
+    }
+
+    /// Returns the decoder that came with the snapshot's encoder, if it did. It serves pictures
+    /// only: a damaged one is logged.
+    fn decoder_of(&self, snapshot: &Snapshot) -> Option<Decoder> {
+        let encoder = TrainedEncoder::of_snapshot(snapshot, self.config);
+        match TrainedDecoder::of(&encoder.sha256(), &self.directory.decoder()) {
+            Ok(trained) => Some(Decoder::new(Isa::best(), &trained?)),
+            Err(error) => {
+                warn!(%error, "cannot draw what latent codes hold");
+                None
+            }
+        }
     }
 }

@@ -206,6 +206,8 @@ impl<'a> ForeignWorlds<'a> {
                  add it, float32 [3], or train without \"+goal\"",
             ));
         }
+        let walls = walls.unwrap_or(self.moment.walls);
+        self.check_walls(walls, passed, hit)?;
         self.moment = Moment {
             velocity_mps: velocity,
             goal_m: goal.unwrap_or([0.0; 3]),
@@ -221,9 +223,29 @@ impl<'a> ForeignWorlds<'a> {
                 3 => Some(EpisodeOutcome::TimedOut),
                 _ => None,
             },
-            walls: walls.unwrap_or(self.moment.walls),
+            walls,
         };
         Ok(())
+    }
+
+    /// Refuses counts of walls that the learner would refuse: it would give the episode to others
+    /// and end the run after several such refusals.
+    fn check_walls(&self, walls: u8, passed: u8, hit: u8) -> PyResult<()> {
+        let before = self.moment.walls_passed;
+        let problem = if walls == 0 {
+            "info[\"walls\"] = 0: a course has at least one".to_owned()
+        } else if passed > walls {
+            format!(
+                "info[\"walls_passed\"] = {passed} of {walls} walls: info[\"walls\"] says how many there are"
+            )
+        } else if passed < before {
+            format!("info[\"walls_passed\"] fell from {before} to {passed} within an episode")
+        } else if hit > walls {
+            format!("info[\"hit_wall\"] = {hit} of {walls} walls: 0 is none of them")
+        } else {
+            return Ok(());
+        };
+        Err(PyValueError::new_err(problem))
     }
 
     /// Refuses an episode that the learner would refuse.
@@ -246,6 +268,7 @@ impl Worlds for ForeignWorlds<'_> {
     fn reset(&mut self, ticket: &Ticket) -> Result<&mut Self, EpisodeFault> {
         let (course, _) = self.courses.course(ticket)?;
         self.moment.walls = course.levels();
+        self.moment.walls_passed = 0;
         self.steps = 0;
         let (name, course_seed) = match ticket.course {
             CourseChoice::Training => (self.training.clone(), None),
