@@ -38,7 +38,7 @@ build_evaluation() {
             exit 1
         }
     done
-    cargo_build "building skein-evaluate and what flying needs (about 3 minutes on two cores the first time)" --bin skein-evaluate
+    cargo_build "building skein-evaluate and what flying needs (3 to 5 minutes on two cores the first time)" --bin skein-evaluate
 }
 
 # Builds what training needs.

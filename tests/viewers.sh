@@ -14,7 +14,8 @@ Rerun (pinned) into an environment of their own, python/viewers in cargo's targe
   - the package mcap reads every value of a recording as the .npz has it
   - Rerun takes the MCAP as it is, and what skein_rl.rerun writes
   - TensorBoard reads curves, pictures, settings and text of a run
-  - every view of the page of skein watch is drawn in a headless Chromium, without an error: tests/page.py
+  - every view of the page of skein watch is drawn in a headless Chromium, and a run is followed to its end, without an error:
+    tests/page.py
 
   RUNS            folder of runs that the page shows [default: a short run, made for it]
   --shots FOLDER  keep pictures of the views there
@@ -23,7 +24,7 @@ Rerun (pinned) into an environment of their own, python/viewers in cargo's targe
 Exit status: 0 all passed, 1 something did not, 2 wrong arguments.
 END
 
-page=if-there shots=() runs=''
+page=if-there shots=() follow=() runs=''
 while (($# > 0)); do
     case $1 in
         --page) page=always && shift ;;
@@ -59,8 +60,12 @@ if [[ -z $runs ]]; then
         cat "$runs/log" >&2
         exit 1
     }
+    # Another trains while the page shows it, and ends there.
+    "$SKEIN" run --config "$repository/tests/small.toml" --run-dir "$runs/followed" --set run.episodes=400 >"$runs/log" 2>&1 &
+    trap 'kill %% 2>/dev/null; rm -rf "$runs"' EXIT
+    follow=(--follow followed)
 fi
 status=0
-SKEIN_WATCH=$target/release/skein-watch "$venv/bin/python" "$repository/tests/page.py" ${shots[@]+"${shots[@]}"} "$runs" || status=$?
+SKEIN_WATCH=$target/release/skein-watch "$venv/bin/python" "$repository/tests/page.py" ${shots[@]+"${shots[@]}"} ${follow[@]+"${follow[@]}"} "$runs" || status=$?
 [[ $status != 77 || $page == always ]] || status=0
 ((status == 0)) || exit 1
