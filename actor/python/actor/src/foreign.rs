@@ -236,7 +236,8 @@ impl<'a> ForeignWorlds<'a> {
             "info[\"walls\"] = 0: a course has at least one".to_owned()
         } else if passed > walls {
             format!(
-                "info[\"walls_passed\"] = {passed} of {walls} walls: info[\"walls\"] says how many there are"
+                "info[\"walls_passed\"] = {passed} of {walls} walls: info[\"walls\"] says how \
+                 many there are"
             )
         } else if passed < before {
             format!("info[\"walls_passed\"] fell from {before} to {passed} within an episode")
