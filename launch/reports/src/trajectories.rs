@@ -150,7 +150,7 @@ pub fn draw_trajectories(courses: &[FlownCourse<'_>], path: &Path) -> Result<(),
     let omitted = if others.is_empty() { 0 } else { OMITTED };
     let mut canvas = Canvas::new(WIDTH, TOP + blocks + omitted);
     canvas.draw(|area| {
-        draw_legend(area, shown.iter().any(|flown| !flown.course.is_world()))?;
+        draw_legend(area, shown)?;
         let mut top = TOP;
         for flown in shown {
             draw_course(area, flown, top)?;
@@ -472,9 +472,12 @@ fn draw_course(
     FrontViews::of(course, pixels_per_metre(course)).draw(area, episodes, below)
 }
 
-/// Explains the picture: `has_walls`, or only obstacles.
-fn draw_legend(area: &Area<'_>, has_walls: bool) -> Result<(), Box<dyn std::error::Error>> {
-    let (note, [dark, pale]) = match has_walls {
+/// Explains the picture of courses with walls, or of worlds, which have only obstacles.
+fn draw_legend(
+    area: &Area<'_>,
+    courses: &[FlownCourse<'_>],
+) -> Result<(), Box<dyn std::error::Error>> {
+    let (note, [dark, pale]) = match courses.iter().any(|flown| !flown.course.is_world()) {
         true => (
             "Below each course, its walls from the front: a dot where the drone's centre crossed \
              the wall, a cross where it collided within its own width of the wall.",
