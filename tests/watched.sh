@@ -15,9 +15,9 @@ Trains 120 episodes of configs/generalist.toml in each way of ROUNDS rounds (4):
   recorded  with every training episode recorded (run.record_every=1)
 
 Prints seconds of each: on the clock, of the processor for the run, and of the processor for the page's server; then medians over
-the rounds of the first two, divided by the plain way's of the same round. On a virtual machine the clock scatters by tenths, the
-processor's time less. About half a minute a training on two cores, which should do nothing else. Every way must end with the same policy. Then copies of a run,
-50 with 20,000 episodes and one with 1,000,000, are listed, described and drawn: seconds of each answer, and the server's memory.
+the rounds of the first two, divided by the plain way's of the same round. On a virtual machine both scatter by a tenth. About 40
+seconds a training on two cores, which should do nothing else. Every way must end with the same policy. Then copies of a run, 50
+with 20,000 episodes and one with 1,000,000, are listed, described and drawn: seconds of each answer, and the server's memory.
 
 Exit status: 0 all policies are equal, 1 something failed or differs, 2 wrong arguments.
 END
@@ -26,7 +26,7 @@ END
     exit 2
 }
 
-# What a page that shows a run's curves, settings, actors and newest episodes asks for.
+# Asks each second for all that a page shows of a run: curves, settings, actors, the newest episodes.
 read_page() {
     local api=$1/api run=$2
     while true; do

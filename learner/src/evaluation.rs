@@ -165,12 +165,11 @@ pub(crate) fn write_reconstructions(
         let codes = shown().map(|(_, seen)| &seen.latent[..latent]);
         codes.flat_map(|code| decoder.decode(code)).collect()
     };
-    let reconstruction = match trainer.reconstruct(&chosen) {
-        Some(reconstruction) => reconstruction,
-        None => match decoder {
-            Some(decoder) => decoded(decoder),
-            None => return Ok(None),
-        },
+    let Some(reconstruction) = trainer
+        .reconstruct(&chosen)
+        .or_else(|| decoder.map(decoded))
+    else {
+        return Ok(None);
     };
     let shape = vec![chosen.len() / IMAGE_PIXELS, IMAGE_HEIGHT, IMAGE_WIDTH];
     let view = |bytes| TensorView::new(Dtype::U8, shape.clone(), bytes);

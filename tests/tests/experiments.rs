@@ -129,7 +129,7 @@ fn an_experiment_is_interrupted_resumed_reported_and_published() {
     assert_a_job_runs_alone(&scene, &runs);
     let mut experiment = scene.start();
     until("the first run has episodes", || {
-        (episodes(&runs[0]).len() >= 5).then_some(())
+        (episodes(&runs[0]).len() >= 20).then_some(())
     });
     kill_process(
         Pid::from_raw(experiment.id().cast_signed()).unwrap(),

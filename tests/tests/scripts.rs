@@ -110,6 +110,7 @@ fn wrong_arguments_end_with_status_2_and_a_line_on_the_remedy() {
         "tests/bench.sh",
         "tests/fuzz.sh",
         "tests/viewers.sh",
+        "tests/watched.sh",
     ] {
         let shown = bash(&format!("{script} --nonsense; echo status $?"));
         let help = format!("see {script} --help");

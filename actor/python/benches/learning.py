@@ -306,7 +306,8 @@ def main():
     parser.add_argument("--peers", default=",".join(PEERS))
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--steps", type=int, default=30_000)
-    parser.add_argument("--threads", type=int, default=2, help="of Skein's learner; PyTorch has one, with which it is faster")
+    # PyTorch has one thread: with two it is slower here.
+    parser.add_argument("--threads", type=int, default=2, help="of Skein's learner")
     parser.add_argument("--skein", default=str(REPOSITORY / "target" / "release" / "skein"))
     asked = parser.parse_args()
     names = asked.peers.split(",")

@@ -203,11 +203,7 @@ class CorridorEnv(gymnasium.Env[Observation, Action]):
 def refusal(error: RuntimeError, remedy: str = "") -> Exception:
     """The exception for a call that the simulator could not do: no episode is in progress, or
     another thread's call is. ``remedy`` is added to the first."""
-    if task.in_use(error):
-        return RuntimeError(
-            "another thread's call is in progress: give each thread an environment of its own"
-        )
-    return ResetNeeded(f"{error}{remedy}")
+    return task.in_use(error, "an environment") or ResetNeeded(f"{error}{remedy}")
 
 
 def actions_of(actions: Any, shape: tuple[int, ...]) -> bytes:

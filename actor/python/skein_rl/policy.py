@@ -136,18 +136,14 @@ class Policy:
         try:
             return self._act(observation, episode_start, deterministic)
         except RuntimeError as error:
-            if task.in_use(error):
-                raise RuntimeError(
-                    "another thread's call is in progress: give each thread a policy of its own"
-                ) from None
-            raise
+            raise task.in_use(error, "a policy") or error from None
 
     def _act(
         self, observation: Mapping[str, npt.NDArray[Any]], episode_start: Any, deterministic: bool
     ) -> npt.NDArray[np.float32]:
         if "velocity" not in observation:
             raise KeyError("the observation has no \"velocity\": observe it, float32 [3]")
-        velocity = np.asarray(observation["velocity"], dtype=np.float32)
+        velocity = np.asarray(observation["velocity"])
         if velocity.ndim not in (1, 2):
             raise ValueError(f"velocity has the shape {velocity.shape}: give [3] or [n, 3]")
         single = velocity.ndim == 1
@@ -175,7 +171,7 @@ class Policy:
         block = self._core.act(
             None if depth is None or latent is not None else _images(depth, rows),
             numbers("latent", self.latent),
-            _numbers("velocity", observation["velocity"], (*lead, 3)),
+            _numbers("velocity", velocity, (*lead, 3)),
             numbers("previous_action", len(self.action_names)),
             numbers("goal", 3),
             starts.astype(np.bool_).tolist(),

@@ -214,7 +214,12 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def in_use(error: RuntimeError) -> bool:
-    """Whether another thread's call of the same object is in progress."""
+def in_use(error: RuntimeError, thing: str) -> RuntimeError | None:
+    """The exception for a call of an object that another thread's call uses; None if ``error``
+    says something else."""
     # PyO3's words for it.
-    return str(error).startswith("Already")
+    if not str(error).startswith("Already"):
+        return None
+    return RuntimeError(
+        f"another thread's call is in progress: give each thread {thing} of its own"
+    )

@@ -3,6 +3,7 @@
 import os
 import pathlib
 import subprocess
+import threading
 
 import numpy as np
 import pytest
@@ -103,3 +104,22 @@ def snapshot_file(path, config, latent, step_len, history, outputs, width=16, se
     }
     save_file(tensors, path, metadata)
     return path
+
+
+def refused_in_threads(call, times):
+    """Exceptions of a call that four threads make at the same time, so many times each."""
+    refused = []
+
+    def repeat():
+        for _ in range(times):
+            try:
+                call()
+            except Exception as error:
+                refused.append(error)
+
+    threads = [threading.Thread(target=repeat) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return refused

@@ -5,13 +5,12 @@ import os
 import pickle
 import subprocess
 import sys
-import threading
 import warnings
 
 import gymnasium
 import numpy as np
 import pytest
-from conftest import CONFIGS, rollout, same
+from conftest import CONFIGS, refused_in_threads, rollout, same
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
@@ -276,20 +275,7 @@ def test_the_order_of_calls_is_checked():
 def test_a_second_thread_is_told_that_it_is_one():
     vector = skein_rl.make_vec(16)
     vector.reset(seed=1)
-    refused = []
-
-    def fly():
-        for _ in range(30):
-            try:
-                vector.step(np.zeros((16, 2)))
-            except Exception as error:
-                refused.append(error)
-
-    threads = [threading.Thread(target=fly) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    refused = refused_in_threads(lambda: vector.step(np.zeros((16, 2))), 30)
     assert refused
     assert all(type(error) is RuntimeError and "another thread" in str(error) for error in refused)
     vector.step(np.zeros((16, 2)))

@@ -1,10 +1,10 @@
 """Policies, beside the actor."""
 
 import pickle
-import threading
 
 import numpy as np
 import pytest
+from conftest import refused_in_threads
 
 import skein_rl
 
@@ -45,20 +45,7 @@ def test_a_batch_is_its_rows(policy):
 def test_a_second_thread_is_told_that_it_is_one(generalist):
     policy = skein_rl.Policy.load(generalist, threads=1)
     observations, _ = skein_rl.make_vec(16).reset(seed=1)
-    refused = []
-
-    def act():
-        for _ in range(10):
-            try:
-                policy.act(observations)
-            except Exception as error:
-                refused.append(error)
-
-    threads = [threading.Thread(target=act) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    refused = refused_in_threads(lambda: policy.act(observations), 10)
     assert refused
     assert all(type(error) is RuntimeError and "another thread" in str(error) for error in refused)
     policy.act(observations)

@@ -420,6 +420,7 @@ fn check_distinct_files(arguments: &Arguments, snapshot: &Path) -> anyhow::Resul
             run.identity(),
             run.summary_json(),
             run.episodes_csv(),
+            run.decoder(),
         ]
         .map(|file| ("a file of the run", file))
     });

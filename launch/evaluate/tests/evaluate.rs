@@ -316,12 +316,12 @@ fn a_picture_replaces_no_device_and_no_other_result() {
     }
     assert!(!at.join("one").exists());
     // Nor a file of the run.
-    for (option, file) in [("--gif", "decoder.safetensors"), ("--failures", "a.gif")] {
+    for (option, file) in [("--gif", "a.png"), ("--failures", "a.gif")] {
         let other = refused(&[option, file]);
         assert!(other.contains("give it a name that ends in ."), "{other}");
     }
-    for option in ["--json", "--gif"] {
-        let own = refused(&[option, "config.toml"]);
+    for (option, file) in [("--json", "decoder.safetensors"), ("--gif", "config.toml")] {
+        let own = refused(&[option, file]);
         let message = format!("{option} and a file of the run are the same");
         assert!(own.contains(&message), "{own}");
     }

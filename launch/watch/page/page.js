@@ -205,7 +205,7 @@ async function curves(kept) {
   }
   view.dataset.names = names.join();
   const plot = element("div", { class: "plot" });
-  const hint = element("p", { class: "hint" }, "Walls passed, return and steps are means of 50 training episodes; the others are TensorBoard's.");
+  const hint = element("p", { class: "hint" }, "Walls passed, return, steps and policy lag are means of 50 training episodes; the others are TensorBoard's.");
   return {
     nodes: [choices, element("p", { class: "problem", role: "alert" }, problems.join("; ")), plot, hint],
     after: () => Plotly.newPlot(plot, traces, plotLayout, CONFIG),
